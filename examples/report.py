@@ -15,11 +15,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import training.extra  # noqa: F401
 
 # isort: split
-from training.comparison.report import differences, outcomes, rate_table, write_report
+from training.comparison.report import write_report
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,9 +35,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    return write_report(
-        parser, arguments, lambda rows: [outcomes(rows), differences(rows)], rate_table
-    )
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of comparisons")
+    parser.add_argument("--output", type=Path, help="folder (default: the first comparison's)")
+    options = parser.parse_args(arguments)
+    there = [folder.resolve() for folder in options.folders]
+    for folder, path in zip(options.folders, there, strict=True):
+        if there.count(path) > 1:
+            parser.error(f"{folder} is named twice: its runs count once")
+    try:
+        print(write_report(options.folders, options.output or options.folders[0]))
+    except ValueError as error:
+        parser.error(" ".join(str(error).split()))
+    return 0
 
 
 if __name__ == "__main__":

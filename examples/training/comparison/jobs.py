@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -171,36 +170,6 @@ class Comparison:
     evaluation: Evaluation = TESTED
 
     @property
-    def arguments(self) -> list[str]:
-        """The command line of ``compare.py``; what it has by default is left out."""
-        words = ["--folder", str(self.folder)]
-        words += [f"--arm={arm.name}:{','.join(arm.settings)}" for arm in self.arms if arm.name]
-        if self.learners != ("ddpg",):
-            words += ["--learners", *self.learners]
-        words += ["--methods", *self.methods, "--seeds", *map(str, self.seeds)]
-        if self.evaluation != TESTED:
-            words += ["--worlds", *self.evaluation.words]
-            words += ["--episodes", str(self.evaluation.episodes)]
-        if self.evaluation.physics is not None:
-            words += ["--physics", self.evaluation.physics]
-        if self.evaluation.filtered:
-            words += ["--filter"]
-        return [*words, "--", *self.settings]
-
-    @property
-    def command(self) -> str:
-        """Command that makes the runs, and leaves alone those that are made.
-
-        Examples:
-            >>> settings, arms = ("robots=4",), (Arm("a"),)
-            >>> one = Comparison(Path("runs/x"), ("per",), settings, range(2), arms=arms)
-            >>> one.command
-            'python examples/compare.py --folder runs/x --arm=a: --methods per --seeds 0 1 -- \
-robots=4'
-        """
-        return shlex.join(["python", "examples/compare.py", *self.arguments])
-
-    @property
     def jobs(self) -> list[Job]:
         """Its runs, in the order in which they are made."""
         return [
@@ -211,13 +180,6 @@ robots=4'
             for method in self.methods
             for arm in self.arms
         ]
-
-    def runs(self) -> dict[str, list[Job]]:
-        """Return its runs by arm, or by method if it has no arms."""
-        found: dict[str, list[Job]] = {}
-        for job in self.jobs:
-            found.setdefault(job.arm.name or job.method, []).append(job)
-        return found
 
 
 def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:

@@ -1,14 +1,13 @@
 """Tables of comparisons in Markdown, from the rows of their episodes and evaluations.
 
-The unit is the run: the episodes of one policy are not independent, as whether it found the way
+The unit is the run: the episodes of one policy are not independent, as whether it found the path
 around a bar decides many of them. Intervals and tests are of the means of runs.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -24,44 +23,38 @@ from training.statistics import Array, difference_interval, mean_interval, permu
 from training.worlds import family
 
 RATES = (0.9, 0.95)
-"""Rates of greedy success in validation that the time to is told of."""
+"""Rates of greedy success in validation of which the time until then is reported."""
 ARM = ("learner", "method", "arm")
 
 
-def write_report(
-    parser: argparse.ArgumentParser,
-    arguments: Sequence[str] | None,
-    tables: Callable[[pd.DataFrame], list[str]],
-    *speeds: Callable[[Runs], str],
-) -> int:
-    """Read the rows of the folders on a command line, write ``tables.md`` and a figure."""
-    parser.add_argument("folders", type=Path, nargs="+", help="folders of comparisons")
-    parser.add_argument("--output", type=Path, help="folder (default: the first comparison's)")
-    options = parser.parse_args(arguments)
-    output = options.output or options.folders[0]
-    there = [folder.resolve() for folder in options.folders]
-    for folder, path in zip(options.folders, there, strict=True):
-        if there.count(path) > 1:
-            parser.error(f"{folder} is named twice: its runs count once")
-    try:
-        files.check_folder(output)
-        rows = read_comparisons(options.folders)
-        evaluations = tables_of_runs(rows, files.EVALUATIONS)
-        parts = sections(rows, tables)
-    except ValueError as error:
-        parser.error(" ".join(str(error).split()))
+def write_report(folders: Sequence[Path], output: Path) -> str:
+    """Write ``tables.md`` and ``evaluations.png`` of comparisons.
+
+    Args:
+        folders: Folders of the comparisons.
+        output: Folder of the two files.
+
+    Returns:
+        The tables.
+
+    Raises:
+        ValueError: If there are no rows, a file is damaged, or the output is no folder.
+    """
+    files.check_folder(output)
+    rows = read_comparisons(folders)
+    evaluations = tables_of_runs(rows, files.EVALUATIONS)
+    parts = sections(rows)
     output.mkdir(parents=True, exist_ok=True)
     if evaluations:
-        parts += ["## Evaluations during training", *(speed(evaluations) for speed in speeds)]
+        parts += ["## Evaluations during training", rate_table(evaluations)]
         plot_evaluations(evaluations, output / "evaluations.png")
     text = "\n\n".join(part for part in parts if part)
     write_text_atomically(text + "\n", output / "tables.md")
-    print(text)
-    return 0
+    return text
 
 
 def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
-    """The evaluation episodes of comparisons.
+    """Read the evaluation episodes of comparisons.
 
     Args:
         folders: Their folders; seeds in two of them are two runs.
@@ -106,7 +99,7 @@ def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
 
 
 def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
-    """A table of each run's own folder, by arm and run; runs without it are left out."""
+    """Return a table of each run's folder, by arm and run; runs without the table are left out."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for (arm, run, path), _ in rows.groupby(["arm", "run", "path"], sort=False):
         table = read_table(Path(str(path)) / name)
@@ -115,27 +108,27 @@ def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
     return found
 
 
-def sections(rows: pd.DataFrame, tables: Callable[[pd.DataFrame], list[str]]) -> list[str]:
-    """Headed tables of each physics and family of worlds, and success in all worlds together."""
+def sections(rows: pd.DataFrame) -> list[str]:
+    """Return headed tables of each physics and family of worlds, and of all worlds together."""
     parts = []
     for physics, driven in rows.groupby("physics", sort=False):
         how = f", {physics!s}" if physics else ""
         for where, found in driven.groupby("family", sort=False):
-            parts += [f"## {where}{how}", *tables(found)]
+            parts += [f"## {where}{how}", outcomes(found), differences(found)]
         if driven["family"].nunique() > 1:
             parts += [f"## Success in all worlds{how}", success_table(driven)]
     return parts
 
 
 def table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     head = list(head)
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def scores(rows: pd.DataFrame, column: str) -> Array:
-    """Values of a column, shape ``[runs, pairs]``; flags are 0 and 1."""
+    """Return the values of a column, shape ``[runs, pairs]``; flags are 0 and 1."""
     matrix = rows.pivot(index="run", columns=["world", "episode"], values=column)
     matrix = matrix.loc[rows["run"].unique()].astype(float)
     if matrix.isna().to_numpy().any():
@@ -143,13 +136,8 @@ def scores(rows: pd.DataFrame, column: str) -> Array:
     return matrix.to_numpy()
 
 
-def outcomes(rows: pd.DataFrame, *, interval: bool = True) -> str:
-    """A table of the success of each arm and of each run, and means over the runs.
-
-    Args:
-        rows: Evaluation episodes.
-        interval: Whether success has Student's 95 % interval over the runs.
-    """
+def outcomes(rows: pd.DataFrame) -> str:
+    """Return a table of the success of each arm and of each run, and means over the runs."""
     lines = []
     width = columns_of(rows["arm"])
     for arm, found in rows.groupby("arm", sort=False):
@@ -160,19 +148,19 @@ def outcomes(rows: pd.DataFrame, *, interval: bool = True) -> str:
             [
                 *cells(str(arm), width),
                 f"{success.mean():.1%}",
-                *([_interval(success.mean(axis=1))] if interval else []),
+                _interval(success.mean(axis=1)),
                 ", ".join(f"{value:.1%}" for value in success.mean(axis=1)),
                 *rates,
                 f"{scores(found, 'spl').mean():.3f}",
                 f"{reached.mean():.1f}" if reached.size else "",
             ]
         )
-    head = [*ARM[:width], "success", *["95 %"] * interval, "of each run", "collision", "timeout"]
+    head = [*ARM[:width], "success", "95 %", "of each run", "collision", "timeout"]
     return table([*head, "SPL", "time [s]"], lines)
 
 
 def success_table(rows: pd.DataFrame) -> str:
-    """Success of each arm in each world or generator, and in brackets that of its worst run."""
+    """Return the success of each arm in each world or generator, and of its worst run."""
     arms = list(rows["arm"].unique())
     families = {str(name): found for name, found in rows.groupby("family", sort=False)}
     lines = []
@@ -190,7 +178,7 @@ def success_table(rows: pd.DataFrame) -> str:
 
 
 def differences(rows: pd.DataFrame) -> str:
-    """A table of the differences between arms, tested over runs; empty for one arm."""
+    """Return a table of the differences between arms, tested over runs; empty for one arm."""
     arms = {str(arm): found for arm, found in rows.groupby("arm", sort=False)}
     lines = []
     for a, b in combinations(arms, 2):
@@ -205,7 +193,7 @@ def differences(rows: pd.DataFrame) -> str:
 
 
 def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
-    """Actions and time of training after which validation first had a rate of success."""
+    """Return actions and time of training until validation first had a rate of success."""
     lines = []
     width = columns_of(curves)
     for arm, runs in curves.items():
@@ -220,7 +208,7 @@ def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
 
 
 def median_of(values: Iterable[float]) -> str:
-    """The median of what runs took, of an even number the lower of the two in the middle.
+    """Return the median over runs, of an even number the lower of the two in the middle.
 
     Args:
         values: Of each run; infinite where it never came so far.
