@@ -131,15 +131,17 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"method": "reaper", "reliability": -1}, "reliability must be positive and finite"),
         ({"boost": "x"}, "boost must be true or false, got 'x'"),
         ({"beta_end": NAN}, r"beta_end must be in \[0, 1\], got nan"),
-        (
-            {"method": "ddpg_radam", "curiosity": -1},
-            "curiosity must be positive and finite",
-        ),
+        ({"method": "ddpg_radam", "curiosity": -1}, "curiosity must be positive and finite"),
         ({"boost_target": -1}, r"boost_target must be in \[0, 1\), got -1"),
         ({"positive_above": NAN}, "positive_above must be a finite number or 'mean', got nan"),
         ({"weight_floor": 1.0}, r"weight_floor must be in \[0, 1\), got 1.0"),
         ({"method": "geometric", "recency": -1}, "recency must be finite and not negative, got -1"),
         ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
+        *[
+            ({"method": "her", "hindsight": value}, "hindsight must be an integer from 0")
+            for value in (-1, True)
+        ],
+        ({"method": "reaper", "hindsight": 2}, "hindsight must be 0 with reaper, which .* got 2"),
         ({"method": "klper"}, "method 'klper' needs policy and sigma"),
         ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
         ({"method": 3}, "method must be a name or a Method, got 3"),

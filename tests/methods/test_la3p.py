@@ -1,11 +1,13 @@
-"""LA3P: three parts of a batch, each with the probabilities that it should have."""
+"""LA3P, LAP and uniform halves: each part of a batch has its probabilities."""
 
 import pytest
 import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
-from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches
+from tests.mpfa.test_updates import make_learner, make_rows
+from torchrl_mpfa import SignalSampler, run_updates
+from torchrl_mpfa.methods import loss_options, make_replay
+from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches, uniform_halves
 from torchrl_mpfa.methods.lap import LAPFloor
 
 ALPHA = 0.4
@@ -156,3 +158,74 @@ def test_a_whole_batch_outside_of_a_training_step_is_by_priority():
     buffer = make_la3p(15, 20_000)
     set_signals(buffer, td_error=errors)
     assert_shares(buffer.sample()["index"], shares_by_hand(errors.tolist())[1], samples=20_000)
+
+
+# LAP, whose priorities LA3P has, and the controls of LA3P.
+
+
+def test_probabilities_are_those_of_the_larger_of_error_and_one():
+    errors = torch.rand(12, generator=seeded(2)) * 4
+    sampler = SignalSampler(12, ALPHA, 0.0, 0.0, signals=["td_error"], adjustments=[LAPFloor(1.0)])
+    buffer = make_buffer(sampler, 12, 50_000)
+    set_signals(buffer, td_error=errors)
+    leaf = [max(error, 1.0) ** ALPHA for error in errors.tolist()]
+    expected = torch.tensor([value / sum(leaf) for value in leaf], dtype=torch.double)
+    assert (errors < 1).any()
+    assert (errors > 1).any()
+    assert_shares(buffer.sample()["index"], expected, samples=50_000)
+
+
+def steps_of(name, **settings):
+    """Updates of critic and actor in a training step, and their numbers of transitions."""
+    learner = make_learner(**loss_options(name))
+    replay = make_replay(name, capacity=100, batch_size=32, **settings)
+    replay.buffer.extend(make_rows(100))
+    found = []
+    step = learner._step
+
+    def spy(batch, trains, loss_function):
+        found.append((trains, len(batch)))
+        return step(batch, trains, loss_function)
+
+    learner._step = spy
+    run_updates(replay.buffer, learner, replay.select)
+    assert learner.updates == 1
+    return {
+        who: sum(size for trains, size in found if trains in (who, "both"))
+        for who in ("critic", "actor")
+    }, {who: sum(trains in (who, "both") for trains, _ in found) for who in ("critic", "actor")}
+
+
+def test_halves_make_as_many_updates_on_as_many_transitions_as_la3p():
+    halves, la3p = steps_of("uniform_halves"), steps_of("la3p")
+    assert halves == la3p == ({"critic": 32, "actor": 32}, {"critic": 2, "actor": 2})
+    assert steps_of("ddpg") == ({"critic": 32, "actor": 32}, {"critic": 1, "actor": 1})
+
+
+def test_both_halves_are_uniform():
+    replay = make_replay("uniform_halves", capacity=10, batch_size=40_000)
+    replay.buffer.extend(make_transitions(10))
+    draws = list(replay.select(replay.buffer))
+    assert [draw.trains for draw in draws] == ["both", "both"]
+    assert [draw.new_step for draw in draws] == [True, False]
+    for draw in draws:
+        shares = torch.bincount(draw.batch["index"], minlength=10) / len(draw.batch)
+        assert (shares - 0.1).abs().max() < 0.01
+
+
+def test_an_odd_batch_is_split_and_a_single_transition_is_rejected():
+    buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
+    assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
+    alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)
+    with pytest.raises(ValueError, match="batch_size must be at least 2 for two halves, got 1"):
+        next(uniform_halves(alone))
+
+
+def test_la3p_without_an_exponent_samples_all_its_parts_uniformly():
+    """The other control: everything of LA3P, losses and order, but the priorities."""
+    replay = make_replay("la3p", capacity=10, batch_size=80_000, alpha=0.0)
+    replay.buffer.extend(make_transitions(10))
+    set_signals(replay.buffer, td_error=torch.arange(10.0) ** 3)
+    for draw in replay.select(replay.buffer):
+        shares = torch.bincount(draw.batch["index"], minlength=10) / len(draw.batch)
+        assert (shares - 0.1).abs().max() < 0.01

@@ -36,6 +36,7 @@ from torchrl_mpfa.learners.base import make_optimizer
 from torchrl_mpfa.losses.functional import distance
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.methods.geometric import GeometricSampler
+from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.methods.hvper import HVPERPenalty, value_schedule
 from torchrl_mpfa.methods.klper import KLPERSelection, gaussian_divergence
 from torchrl_mpfa.methods.la3p import LA3PSampler
@@ -194,6 +195,7 @@ ROWS = [
     *rows(of_ten(ReaPERSampler), "exponent", (0.0,), NOT_POSITIVE),
     *rows(of_ten(LA3PSampler), "uniform_fraction", (1.0,), r"must be in \(0, 1\), got"),
     *rows(GeometricSampler, "recency", (-0.1, INF, NAN), NEGATIVE),
+    *rows(partial(HindsightGoals, None), "goals", (0,), NO_COUNT),
     *rows(LAPFloor, "floor", (0.0, -1.0, INF), NOT_POSITIVE),
     *rows(HVPERPenalty, "penalty", (-1,), NEGATIVE),
     *rows(HVPERPenalty, "floor", (0,), NOT_POSITIVE),
