@@ -36,7 +36,7 @@ def signals(count: int, *, seed: int = 0) -> TensorDict:
     return TensorDict(values, [count])
 
 
-def test_a_buffer_made_of_settings_is_the_one_of_the_method() -> None:
+def test_buffer_made_of_settings_equals_that_of_the_method() -> None:
     generator = torch.Generator().manual_seed(3)
     local = make_local_replay(method("mpfa_per"), generator=generator).buffer
     made = MethodReplayBuffer(method("mpfa_per"), seed=3)
@@ -55,13 +55,13 @@ def test_a_buffer_made_of_settings_is_the_one_of_the_method() -> None:
     assert made.rewards().shape == (CAPACITY,)
 
 
-def test_a_seed_of_a_buffer_is_its_own_affair() -> None:
+def test_seed_of_a_buffer_leaves_the_global_generator_unchanged() -> None:
     before = torch.get_rng_state()
     MethodReplayBuffer(method("mpfa_per"), seed=3)
     assert torch.get_rng_state().equal(before)
 
 
-def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
+def test_histograms_of_a_remote_buffer_are_read_from_it() -> None:
     here = MethodReplayBuffer(method("mpfa_per"), seed=3)
     here.extend(make_transitions(40))
     # Stands in for the process: nothing else of the buffer is in this one.
@@ -75,7 +75,7 @@ def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
     assert same(found, known)
 
 
-def test_methods_that_look_into_their_buffer_stay_with_it() -> None:
+def test_method_that_reads_its_buffer_cannot_be_remote() -> None:
     assert {name for name in METHODS if not METHODS[name].remote} == {
         "her",
         "la3p",
@@ -96,7 +96,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cluster")
-def test_a_remote_buffer_samples_by_eq_8_and_leaves_late_signals_out() -> None:
+def test_remote_buffer_samples_by_eq_8_and_leaves_late_signals_out() -> None:
     per = method("per")
     buffer = make_ray_replay(per, seed=1).buffer
     try:

@@ -67,5 +67,5 @@ ABLATIONS = {
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_an_ablation_has_its_signals_and_adjustments_and_no_others(name):
+def test_ablation_has_its_signals_and_adjustments_and_no_others(name):
     assert priorities_of(name) == pytest.approx(ABLATIONS[name], rel=1e-5)

@@ -98,14 +98,14 @@ def test_method_of_ones_own_class_has_its_settings_and_parts():
 
 
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
-def test_a_storage_may_be_given_and_its_size_is_that_of_the_sampler(kind):
+def test_storage_may_be_given_and_its_size_is_that_of_the_sampler(kind):
     storage = kind(77, signals=["td_error"])
     replay = make_replay("per", storage=storage)
     assert replay.buffer.sampler.max_size == 77
     assert replay.method.capacity == 77
 
 
-def test_the_exponent_of_pal_is_that_of_the_method():
+def test_exponent_of_pal_is_that_of_the_method():
     assert loss_options("pal")["pal_alpha"] == 0.4
     assert loss_options("la3p")["pal_alpha"] == 0.4
     assert loss_options(replace(METHODS["pal"], alpha=0.7))["pal_alpha"] == 0.7
@@ -153,7 +153,7 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ),
     ],
 )
-def test_a_mistake_is_rejected_in_one_sentence(arguments, message):
+def test_bad_setting_is_rejected_in_one_sentence(arguments, message):
     with pytest.raises((TypeError, ValueError), match=message):
         make_replay(**arguments)
 
@@ -183,7 +183,7 @@ def test_with_a_floor_all_signals_count_before_the_first_goal(floor, shares):
     assert weights.tolist() == pytest.approx([share / sum(shares) for share in shares])
 
 
-def test_annealing_by_a_fraction_that_is_none_changes_nothing():
+def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():
     replay = make_replay("per", capacity=100)
     for fraction in (-0.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got"):

@@ -11,7 +11,7 @@ def make_combined(capacity, batch_size, filled):
     return make_buffer(CERSampler(), capacity, batch_size, filled=filled)
 
 
-def test_the_newest_transition_is_in_every_batch_across_the_wrap():
+def test_newest_transition_is_in_every_batch_across_the_wrap():
     buffer = make_combined(7, 3, 5)
     for number in range(20):
         slot = int(buffer.extend(make_transitions(1, seed=number))[0])
@@ -19,19 +19,19 @@ def test_the_newest_transition_is_in_every_batch_across_the_wrap():
         assert int(buffer.sample()["index"][0]) == slot
 
 
-def test_of_several_transitions_the_last_is_the_newest():
+def test_last_of_several_transitions_is_the_newest():
     buffer = make_combined(10, 3, 4)
     assert int(buffer.sample()["index"][0]) == 3
 
 
-def test_the_others_are_sampled_uniformly():
+def test_transitions_but_the_newest_are_sampled_uniformly():
     buffer = make_combined(8, 4001, 8)
     others = torch.cat([buffer.sample()["index"][1:] for _ in range(5)])
     shares = torch.bincount(others, minlength=8) / len(others)
     assert (shares - 1 / 8).abs().max() < 0.012
 
 
-def test_a_buffer_that_is_emptied_has_no_newest_transition():
+def test_buffer_that_is_emptied_has_no_newest_transition():
     buffer = make_combined(5, 2, 5)
     buffer.empty()
     with pytest.raises(RuntimeError, match="empty"):

@@ -31,7 +31,7 @@ def make_batch(count=64, *, seed=0, shift=0.0):
     )
 
 
-def test_the_bonus_is_its_formula():
+def test_bonus_is_its_formula():
     foreseen, found = torch.randn(2, 5, 3, generator=seeded(1)).unbind(0)
     expected = [
         0.5 * 0.01 * sum((a - b) ** 2 for a, b in zip(x, y, strict=True))
@@ -40,7 +40,7 @@ def test_the_bonus_is_its_formula():
     assert intrinsic_reward(foreseen, found, scale=0.01).tolist() == pytest.approx(expected)
 
 
-def test_the_losses_are_their_formulas():
+def test_losses_are_their_formulas():
     curiosity, batch = Curiosity(6, 2, forward_share=0.2), make_batch(4)
     encode = curiosity.encoder
     inverse = forward = 0.0
@@ -56,7 +56,7 @@ def test_the_losses_are_their_formulas():
     assert log["forward_loss"].item() == pytest.approx(forward, rel=1e-4)
 
 
-def test_the_bonus_falls_fastest_for_what_is_seen_often():
+def test_bonus_falls_fastest_for_transitions_that_are_seen_often():
     torch.manual_seed(0)
     curiosity = Curiosity(6, 2)
     often, rare = make_batch(seed=1), make_batch(seed=2, shift=5.0)
@@ -73,7 +73,7 @@ def test_the_bonus_falls_fastest_for_what_is_seen_often():
     assert after[0] / before[0] < 0.5 * after[1] / before[1]
 
 
-def test_the_bonus_is_computed_at_each_sampling_and_the_reward_is_kept():
+def test_bonus_is_computed_at_each_sampling_and_the_reward_is_kept():
     curiosity, stored = Curiosity(6, 2), make_batch()
     first, second = stored.clone(), stored.clone()
     curiosity(first)
@@ -89,7 +89,7 @@ def test_the_bonus_is_computed_at_each_sampling_and_the_reward_is_kept():
         )
 
 
-def test_the_models_go_on_from_a_state_that_is_loaded():
+def test_models_with_a_loaded_state_learn_like_those_that_saved_it():
     first, second = Curiosity(6, 2), Curiosity(6, 2)
     for seed in range(3):
         first(make_batch(seed=seed))
@@ -104,7 +104,7 @@ def test_the_models_go_on_from_a_state_that_is_loaded():
 @pytest.mark.parametrize(
     "key", ["observation", "action", ("next", "observation"), ("next", "reward")], ids=str
 )
-def test_a_batch_with_a_number_that_is_none_is_rejected_before_anything_changes(key):
+def test_batch_with_nan_is_rejected_and_changes_nothing(key):
     curiosity, batch = Curiosity(6, 2), make_batch()
     curiosity(make_batch(seed=1))
     before = copy.deepcopy(curiosity.checkpoint())

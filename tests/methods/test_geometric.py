@@ -45,7 +45,7 @@ def test_frequencies_are_those_of_the_law_across_the_wrap(recency, capacity, wri
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 3e-5, 0.3, 0.999])
-def test_an_age_is_the_first_whose_cumulative_probability_exceeds_the_share(rate):
+def test_age_is_the_first_whose_cumulative_probability_exceeds_the_share(rate):
     law = law_by_hand(rate, 50)
     shares = torch.rand(200, generator=seeded(1), dtype=torch.double)
     for share, found in zip(
@@ -77,7 +77,7 @@ def test_in_two_dimensions_age_goes_along_time_and_the_robots_are_alike():
     assert (robot.double().mean() - 0.5).abs() < 0.02
 
 
-def test_the_law_has_one_shape_however_many_transitions_a_run_has():
+def test_law_has_one_shape_however_many_transitions_a_run_has():
     """The oldest tenth against the newest, and the mean age, in a buffer that is hardly filled."""
     for written in (1_000, 24_000):
         replay = make_replay("geometric", capacity=100_000, batch_size=SAMPLES)
@@ -89,7 +89,7 @@ def test_the_law_has_one_shape_however_many_transitions_a_run_has():
         assert age.mean() == pytest.approx(1 / 3 - 1 / math.expm1(3), rel=0.03)
 
 
-def test_what_was_not_stored_is_not_the_newest():
+def test_row_that_was_not_stored_is_not_the_newest():
     sampler = GeometricSampler(recency=0.5)
     sampler.extend(torch.tensor([3, 4, -1]))  # TorchRL's writers mark it so.
     sampler.add(torch.tensor(-1))

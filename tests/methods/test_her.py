@@ -108,7 +108,7 @@ def make_her(method="her", *, generator=0, **settings):
 
 
 @pytest.mark.parametrize("together", [1, 7])
-def test_what_is_stored_is_what_plain_loops_store(together):
+def test_stored_rows_equal_those_of_plain_loops(together):
     buffer, relabel = make_her(goals=2)
     robots, calls = Drive(), []
     for _ in range(42 // together):
@@ -134,7 +134,7 @@ def test_what_is_stored_is_what_plain_loops_store(together):
     }
 
 
-def test_goals_are_each_step_s_outcome_as_often():
+def test_goals_are_the_outcome_of_each_step_equally_often():
     generator, counts = seeded(3), torch.zeros(10)
     for _ in range(4000):
         counts[future_goals(10, 3, generator)] += 1
@@ -159,7 +159,7 @@ def test_rows_in_hindsight_have_priorities_of_their_own(method):
     assert goals[buffer.sample()["index"]].float().mean() > 0.9
 
 
-def test_episodes_under_way_go_on_from_a_saved_state(tmp_path):
+def test_unfinished_episodes_continue_from_a_saved_state(tmp_path):
     def write(buffer, robots, count):
         for _ in range(count):
             buffer.extend(as_tensordict(robots.step()))
@@ -183,7 +183,7 @@ def test_episodes_under_way_go_on_from_a_saved_state(tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["episode", "place", ("next", "place")], ids=str)
-def test_a_row_without_what_goals_need_is_rejected_before_anything_changes(missing):
+def test_row_without_an_entry_of_goals_is_rejected_and_changes_nothing(missing):
     buffer, _ = make_her()
     rows = as_tensordict(Drive().step())
     rows["next", "done"][:] = False
@@ -194,7 +194,7 @@ def test_a_row_without_what_goals_need_is_rejected_before_anything_changes(missi
     assert len(torch.cat(buffer._transform[0]._pending)) == ROBOTS
 
 
-def test_a_method_with_hindsight_says_what_it_needs():
+def test_method_with_hindsight_names_its_entries():
     assert make_replay("her").entries == ("episode",)
     assert make_replay("per", hindsight=1).entries == ("episode",)
     assert make_replay("per").entries == ()

@@ -71,13 +71,13 @@ def test_value_and_error_are_between_zero_and_one():
             assert ((found >= 0) & (found <= 1)).all()
 
 
-def test_of_equal_transitions_the_more_often_replayed_has_the_lower_priority():
+def test_priority_of_equal_transitions_falls_with_their_replays():
     facts = BatchFacts(torch.zeros(3), torch.tensor([1.0, 10.0, 100.0]), torch.arange(3))
     found = HVPERPenalty()(torch.full((3,), 0.5), facts)
     assert found[0] > found[1] > found[2] >= EPS
 
 
-def test_a_negative_value_is_no_error_as_only_its_place_is_kept():
+def test_negative_value_is_no_error_as_only_its_place_is_kept():
     sampler = SignalSampler(
         4, 0.6, 0.4, EPS, signals=[RELATIVE_VALUE, RELATIVE_ERROR], fusion=value_schedule()
     )
@@ -109,7 +109,7 @@ def relative_errors(batches, errors, *, stale=()):
     return table.rows[:, table.column[RELATIVE_ERROR.name]]
 
 
-def test_of_several_batches_in_one_update_each_is_relative_to_itself():
+def test_errors_of_several_batches_in_one_update_are_relative_to_their_own_batch():
     errors = torch.rand(16, generator=seeded(5)) + 0.1
     errors[8:] *= 100
     found = relative_errors(2, errors)
@@ -117,7 +117,7 @@ def test_of_several_batches_in_one_update_each_is_relative_to_itself():
     assert found[8:].tolist() == pytest.approx((errors[8:] / errors[8:].max()).tolist())
 
 
-def test_what_was_overwritten_meanwhile_is_none_of_its_batch():
+def test_overwritten_row_does_not_count_in_its_batch():
     errors = torch.tensor([1.0, 100.0, 2.0, 4.0])
     assert relative_errors(1, errors, stale=[1])[[0, 2, 3]].tolist() == [0.25, 0.5, 1.0]
     errors = torch.tensor([1.0, 2.0, 100.0, torch.nan])

@@ -41,7 +41,7 @@ def test_deviations_narrower_than_the_noise_are_no_further_from_the_policy():
     assert gaussian_divergence(deviation - mean, variance=0.5) < 1e-12
 
 
-def test_the_divergence_of_one_number_by_hand():
+def test_divergence_of_one_number_by_hand():
     # Deviations of 1 and -1: mean 0, variance 1. Against N(0, 1/4): (4 - 1 - ln 4) / 2.
     found = gaussian_divergence(torch.tensor([[1.0], [-1.0]]), variance=0.25)
     assert found.item() == pytest.approx((4 - 1 - math.log(4)) / 2, abs=1e-5)
@@ -64,7 +64,7 @@ class Elsewhere:
         return TensorDict({"action": torch.zeros(len(read), 2)}, [len(read)])
 
 
-def test_the_policy_may_be_on_another_device_than_the_batch():
+def test_policy_may_be_on_another_device_than_the_batch():
     action = torch.tensor([0.0, 0.5]).repeat_interleave(4).unsqueeze(1).expand(8, 2)
     batch = TensorDict({"observation": torch.rand(8, 3), "action": action}, [8])
     chosen = KLPERSelection(Elsewhere(), batches=2, sigma=0.2)(batch)
@@ -118,7 +118,7 @@ def sampled(policy, shifts, *, count=64, sigma=0.2):
 
 
 @pytest.mark.parametrize("best", [0, 1, 2])
-def test_the_batch_of_the_current_policy_is_chosen(best):
+def test_batch_of_the_current_policy_is_chosen(best):
     policy = make_actor(6, 2, width=16)
     shifts = [0.7, 0.7, 0.7]
     shifts[best] = 0.0
@@ -126,7 +126,7 @@ def test_the_batch_of_the_current_policy_is_chosen(best):
     assert batch["number"].tolist() == list(range(64 * best, 64 * (best + 1)))
 
 
-def test_the_present_noise_is_asked_for_at_each_batch():
+def test_noise_of_the_current_episode_is_read_at_each_batch():
     policy = make_actor(6, 2, width=16)
     asked = iter([0.2, 0.7])
     select = KLPERSelection(policy, batches=2, sigma=lambda: next(asked))
@@ -137,7 +137,7 @@ def test_the_present_noise_is_asked_for_at_each_batch():
     assert select(both)["number"][0] == 64
 
 
-def test_of_what_a_buffer_samples_one_batch_is_left_with_its_index():
+def test_chosen_batch_keeps_the_indices_of_the_buffer():
     policy = make_actor(6, 2, width=16)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=30)
     buffer.extend(sampled(policy, [0.0, 0.5]))
@@ -146,7 +146,7 @@ def test_of_what_a_buffer_samples_one_batch_is_left_with_its_index():
     assert batch["number"].equal(batch["index"])
 
 
-def test_what_makes_no_equal_batches_is_rejected():
+def test_rows_that_make_no_equal_batches_are_rejected():
     policy = make_actor(6, 2, width=16)
     with pytest.raises(ValueError, match="64 transitions cannot make 3 equal batches"):
         KLPERSelection(policy, sigma=0.2)(sampled(policy, [0.0]))

@@ -42,14 +42,14 @@ def assert_parts(buffer, errors, *, samples):
         assert_shares(index, expected, samples=samples)
 
 
-def test_the_parts_are_uniform_by_priority_and_by_its_inverse():
+def test_parts_are_uniform_by_priority_and_by_its_inverse():
     errors = torch.rand(15, generator=seeded(3)) * 10
     buffer = make_la3p(15, 40_000)
     set_signals(buffer, td_error=errors)
     assert_parts(buffer, errors, samples=20_000)
 
 
-def test_the_parts_are_right_after_the_ring_buffer_has_wrapped():
+def test_parts_are_right_after_the_ring_buffer_has_wrapped():
     """The public code looks at the slots before the cursor alone, and misses all others."""
     buffer = make_la3p(15, 40_000)
     set_signals(buffer, td_error=torch.full((15,), 3.0))
@@ -59,7 +59,7 @@ def test_the_parts_are_right_after_the_ring_buffer_has_wrapped():
     assert_parts(buffer, errors, samples=20_000)
 
 
-def test_the_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
+def test_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
     first, second = (make_la3p(50, 40_000, filled=9 if n == 0 else 0) for n in range(2))
     errors = torch.rand(9, generator=seeded(5)) * 10
     set_signals(first, td_error=errors)
@@ -89,7 +89,7 @@ def test_both_halves_of_the_critics_batch_update_priorities():
         torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
 
 
-def test_what_cannot_be_parted_is_rejected():
+def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
@@ -128,7 +128,7 @@ def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(
                     errors[slot] = value
 
 
-def test_the_critics_part_finds_the_large_error_that_the_uniform_part_learned():
+def test_critics_part_finds_the_large_error_that_the_uniform_part_learned():
     buffer = make_la3p(2000, 400)
     set_signals(buffer, td_error=torch.zeros(2000))
     draws = la3p_batches(buffer)
@@ -141,7 +141,7 @@ def test_the_critics_part_finds_the_large_error_that_the_uniform_part_learned():
     assert (next(draws).batch["index"] != slot).all()
 
 
-def test_the_actors_part_finds_the_small_errors_that_the_critics_part_learned():
+def test_actors_part_finds_the_small_errors_that_the_critics_part_learned():
     buffer = make_la3p(2000, 400)
     set_signals(buffer, td_error=torch.full((2000,), 1e9))
     draws = la3p_batches(buffer)
@@ -153,7 +153,7 @@ def test_the_actors_part_finds_the_small_errors_that_the_critics_part_learned():
     assert small.float().mean() > 0.95
 
 
-def test_a_whole_batch_outside_of_a_training_step_is_by_priority():
+def test_whole_batch_outside_of_a_training_step_is_by_priority():
     errors = torch.rand(15, generator=seeded(3)) * 10
     buffer = make_la3p(15, 20_000)
     set_signals(buffer, td_error=errors)
@@ -163,7 +163,7 @@ def test_a_whole_batch_outside_of_a_training_step_is_by_priority():
 # LAP, whose priorities LA3P has, and the controls of LA3P.
 
 
-def test_probabilities_are_those_of_the_larger_of_error_and_one():
+def test_probabilities_of_lap_are_those_of_the_larger_of_error_and_one():
     errors = torch.rand(12, generator=seeded(2)) * 4
     sampler = SignalSampler(12, ALPHA, 0.0, 0.0, signals=["td_error"], adjustments=[LAPFloor(1.0)])
     buffer = make_buffer(sampler, 12, 50_000)
@@ -213,7 +213,7 @@ def test_both_halves_are_uniform():
         assert (shares - 0.1).abs().max() < 0.01
 
 
-def test_an_odd_batch_is_split_and_a_single_transition_is_rejected():
+def test_odd_batch_is_split_and_a_single_transition_is_rejected():
     buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
     assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
     alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)

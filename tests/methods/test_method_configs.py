@@ -60,7 +60,7 @@ def test_every_method_is_made_by_its_name(at_once, name):
 
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 @pytest.mark.parametrize("name", OF_ONE_BATCH)
-def test_a_method_of_one_batch_is_a_buffer_in_torchrls_group(at_once, name):
+def test_method_of_one_batch_is_a_buffer_in_torchrls_group(at_once, name):
     buffer = instantiate(at_once.one[name])
     assert isinstance(buffer, SignalReplayBuffer)
     assert buffer.batch_size == 4

@@ -36,7 +36,7 @@ def train(buffer, td_error=1.0):
     return batch
 
 
-def test_a_transition_that_reached_the_cap_is_not_sampled_again():
+def test_transition_that_reached_the_cap_is_not_sampled_again():
     buffer = make_capped(40, 4, 3)
     for _ in range(400):
         spent = set((counts_of(buffer) >= 3).nonzero().squeeze(1).tolist())
@@ -49,7 +49,7 @@ def test_a_transition_that_reached_the_cap_is_not_sampled_again():
         pytest.fail("the cap was never reached")
 
 
-def test_a_pool_that_is_used_up_is_sampled_from_uniformly():
+def test_pool_that_is_used_up_is_sampled_from_uniformly():
     buffer = make_capped(10, 8, 1)
     for _ in range(60):
         train(buffer)
@@ -60,7 +60,7 @@ def test_a_pool_that_is_used_up_is_sampled_from_uniformly():
     assert torch.equal(buffer.sample()["priority_weight"], torch.ones(8))
 
 
-def test_a_transition_that_takes_the_place_of_a_spent_one_counts_again():
+def test_transition_that_takes_the_place_of_a_spent_one_counts_again():
     buffer = make_capped(6, 4, 2, filled=6)
     for _ in range(20):
         train(buffer)
@@ -71,7 +71,7 @@ def test_a_transition_that_takes_the_place_of_a_spent_one_counts_again():
     assert not spent.all()
 
 
-def test_an_update_that_raises_uses_no_transition_up():
+def test_update_that_raises_uses_no_transition_up():
     buffer = make_capped(6, 4, 1)
     buffer.sampler.adjustments = (lambda priority, batch: priority * torch.nan,)
     with pytest.raises(ValueError, match="adjusted priorities must be finite"):

@@ -13,7 +13,7 @@ PAGES = Path(__file__).resolve().parents[2] / "docs/methods"
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
 @pytest.mark.parametrize("page", ["README.md", "mpfa_per.md"])
-def test_the_examples_of_a_page_run_in_their_order(page, monkeypatch):
+def test_examples_of_a_page_run_in_their_order(page, monkeypatch):
     monkeypatch.setattr("builtins.print", lambda *words: None)
     # What a page adds to the catalogue is gone afterwards.
     monkeypatch.setattr("torchrl_mpfa.methods.METHODS", dict(METHODS))

@@ -22,7 +22,7 @@ def shares_by_hand(errors):
     return torch.tensor([value / sum(leaf) for value in leaf], dtype=torch.double)
 
 
-def test_the_share_of_a_rank_is_its_formula():
+def test_share_of_a_rank_is_its_formula():
     found = rank_share(torch.tensor([1.0, 2.0, 10.0]), alpha=ALPHA)
     assert found.tolist() == pytest.approx([1.0, 2.0**-ALPHA, 10.0**-ALPHA])
 
@@ -35,7 +35,7 @@ def test_transitions_are_sampled_by_their_rank():
     assert_shares(buffer.sample()["index"], expected, samples=50_000)
 
 
-def test_an_outlier_changes_nothing_but_its_own_rank():
+def test_outlier_changes_nothing_but_its_own_rank():
     errors = torch.arange(1.0, 9.0)
     buffers = [make_buffer(make_sampler(8, rank_refresh=0), 8, 1000) for _ in range(2)]
     set_signals(buffers[0], td_error=errors)
@@ -55,7 +55,7 @@ def test_equal_priorities_have_one_share_that_of_their_mean_rank():
     torch.testing.assert_close(leaves, ranks.pow(-ALPHA))
 
 
-def test_a_priority_that_stays_keeps_its_share_between_two_sortings():
+def test_priority_that_stays_keeps_its_share_between_two_sortings():
     buffer = make_buffer(make_sampler(6, rank_refresh=0), 6, 4)
     errors = torch.tensor([2.0, 5.0, 1.0, 2.0, 9.0, 2.0])
     set_signals(buffer, td_error=errors)

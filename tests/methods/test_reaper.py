@@ -166,7 +166,7 @@ def test_frequencies_are_those_of_the_product(combined):
     assert_shares(buffer.sample()["index"], shares, samples=60_000)
 
 
-def test_an_early_error_counts_less_than_the_same_error_at_the_end():
+def test_early_error_counts_less_than_the_same_error_at_the_end():
     """Errors from badly known values to bootstrap from, against errors of a reward alone."""
     buffer = make_reaper([0] * 50)
     set_signals(buffer, td_error=torch.ones(50))
@@ -192,7 +192,7 @@ def test_another_alpha_keeps_the_reliabilities():
     assert buffer.sampler._sum_tree[slots].equal(again.sampler._sum_tree[slots])
 
 
-def test_it_goes_on_where_it_was_saved():
+def test_loaded_buffer_samples_like_the_saved_one():
     first, second = (make_reaper([0, 0, 1, 1, 1, 2], samples=3) for _ in range(2))
     set_signals(first, td_error=torch.arange(6.0))
     second.load_state_dict(first.state_dict())
@@ -206,7 +206,7 @@ def test_it_goes_on_where_it_was_saved():
         assert found[0].equal(found[1])
 
 
-def test_what_is_missing_is_named():
+def test_missing_entry_or_part_is_named():
     replay = make_replay("reaper", capacity=10, batch_size=2)
     assert replay.entries == ("episode",)
     assert make_replay("per", capacity=10).entries == ()

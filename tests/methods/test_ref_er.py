@@ -33,7 +33,7 @@ def random_actions(seed, count=COUNT):
     return torch.rand(count, 2, generator=seeded(seed), dtype=torch.double) * 2 - 1
 
 
-def test_the_ratio_is_that_of_two_densities():
+def test_ratio_is_that_of_two_densities():
     action, now, then = (random_actions(seed) for seed in range(3))
     sigma = torch.rand(COUNT, 1, generator=seeded(3), dtype=torch.double) + 0.2
     found = importance_ratio(action, now, then, sigma)
@@ -105,7 +105,7 @@ def test_near_transitions_have_ratios_within_the_limit_and_noise_of_at_least_a_f
     assert far == {"low", "high", "near"}
 
 
-def test_the_rate_of_the_weight_depends_on_the_capacity():
+def test_rate_of_the_weight_depends_on_the_capacity():
     learner = make_learner(**loss_options("ref_er"))
     replay = make_replay("ref_er", capacity=10 * COUNT, batch_size=50, policy=learner.policy)
     replay.buffer.extend(rows_near_and_far(learner, 1.0))
@@ -115,7 +115,7 @@ def test_the_rate_of_the_weight_depends_on_the_capacity():
     assert replay.buffer.sampler.policy_weight == pytest.approx((1 - rate) * 0.5)
 
 
-def test_what_is_far_teaches_neither_critic_nor_actor():
+def test_far_transitions_teach_neither_critic_nor_actor():
     """The update is that of the near transitions alone, over the size of the batch."""
     learner = make_learner(**loss_options("ref_er"))
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
@@ -131,7 +131,7 @@ def test_what_is_far_teaches_neither_critic_nor_actor():
         torch.testing.assert_close(losses[name], scaled, rtol=1e-4, atol=1e-6)
 
 
-def test_the_weight_falls_while_too_many_transitions_are_far():
+def test_weight_falls_while_too_many_transitions_are_far():
     learner = make_learner(**loss_options("ref_er"))
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
     sampler = replay.buffer.sampler
@@ -153,7 +153,7 @@ def test_the_weight_falls_while_too_many_transitions_are_far():
 
 
 @pytest.mark.parametrize("rate", [0.0003, 0.1])
-def test_the_weight_starts_near_zero_and_never_leaves_its_range(rate):
+def test_weight_starts_near_zero_and_never_leaves_its_range(rate):
     """The authors' rule in plain steps, up from their start and down from the end."""
     weight = ReFERSampler().policy_weight
     assert weight == 1e-4
@@ -169,7 +169,7 @@ def test_the_weight_starts_near_zero_and_never_leaves_its_range(rate):
     assert next_weight(0.999, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.9 * 0.999 + 0.001)
 
 
-def test_a_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
+def test_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
     distances = {}
     for name, settings in (("ref_er", {"far_share": 0.0}), ("ddpg", {})):
         learner = make_learner(**loss_options("ref_er"))
@@ -192,7 +192,7 @@ def test_a_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
     assert distances["ref_er"] < 0.5 * distances["ddpg"]
 
 
-def test_the_loss_of_the_actor_is_that_of_the_formula():
+def test_loss_of_the_actor_is_that_of_the_formula():
     loss, weight, held = (torch.rand(5, generator=seeded(n)) for n in range(3))
     action, mean = (random_actions(n, 5).float() for n in (3, 4))
     sigma = torch.rand(5, 1, generator=seeded(5)) + 0.2
@@ -228,7 +228,7 @@ def test_sac_is_held_and_set_free_as_well():
 
 
 @pytest.mark.parametrize("way", ["state", "folder"])
-def test_the_weight_is_saved(way, tmp_path):
+def test_weight_is_saved_and_loaded(way, tmp_path):
     first, second = (make_buffer(ReFERSampler(), 9, 2) for _ in range(2))
     first.sampler.policy_weight, first.sampler.batches = 0.25, 7
     restore(second, first, tmp_path if way == "folder" else None)
@@ -239,14 +239,14 @@ def test_the_weight_is_saved(way, tmp_path):
     assert second.sampler.policy_weight == 0.25
 
 
-def test_a_buffer_that_is_emptied_begins_with_the_first_weight():
+def test_buffer_that_is_emptied_begins_with_the_first_weight():
     buffer = make_buffer(ReFERSampler(), 9, 2)
     buffer.sampler.policy_weight, buffer.sampler.batches = 0.25, 7
     buffer.empty()
     assert (buffer.sampler.policy_weight, buffer.sampler.batches) == (1e-4, 7)
 
 
-def test_what_is_missing_is_named():
+def test_missing_entry_or_part_is_named():
     with pytest.raises(ValueError, match="method 'ref_er' needs policy"):
         make_replay("ref_er")
     policy = make_actor(6, 2, width=8)

@@ -32,7 +32,7 @@ def by_hand(errors, quantiles, least):
     return 0.5 * math.log(1 + (mean**2 + disagreement) / max(noise, least**2))
 
 
-def test_the_gain_is_that_of_distance_and_disagreement_over_noise():
+def test_gain_is_that_of_distance_and_disagreement_over_noise():
     generator = seeded(0)
     errors = torch.randn(5, 30, generator=generator, dtype=torch.double)
     quantiles = torch.randn(30, 7, generator=generator, dtype=torch.double)
@@ -43,7 +43,7 @@ def test_the_gain_is_that_of_distance_and_disagreement_over_noise():
         assert found[row].item() == pytest.approx(expected)
 
 
-def test_numbers_of_the_gain():
+def test_gain_of_single_transitions_equals_a_hand_calculation():
     # A distance of 2 and a disagreement of 1, over a variance of 4.
     gain = information_gain_priority(torch.tensor([[1.0], [3.0]]), torch.tensor([[-2.0, 2.0]]))
     assert gain.item() == pytest.approx(0.5 * math.log(1 + (4 + 1) / 4))
@@ -52,7 +52,7 @@ def test_numbers_of_the_gain():
     assert information_gain_priority(torch.zeros(2, 1), torch.ones(1, 4), least_noise=1.0) == 0
 
 
-def test_the_quantile_loss_equals_a_loop():
+def test_quantile_loss_equals_a_loop():
     quantiles, target = torch.randn(6, 5, generator=seeded(1)), torch.randn(6, generator=seeded(2))
     for row, loss in enumerate(quantile_loss(quantiles, target)):
         total = 0.0
@@ -77,7 +77,7 @@ def test_quantiles_that_minimize_the_loss_have_the_variance_of_the_target():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
+def test_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
     batch, scale = make_batch(), 0.1
     loss = make_of(kind, signals=["information_gain", "td_error"], reward_scale=scale)
     with torch.no_grad():
@@ -98,7 +98,7 @@ def test_the_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_critics_and_actor_start_and_learn_as_without_it(kind):
+def test_critics_and_actor_with_quantiles_start_and_learn_as_without(kind):
     plain = make_of(kind, signals=["td_error"])
     loss = make_of(kind, signals=["information_gain"])
     for each in (plain, loss):
@@ -119,7 +119,7 @@ def test_critics_and_actor_start_and_learn_as_without_it(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_trace_writes_the_same_gain(kind):
+def test_trace_writes_the_same_gain(kind):
     loss = make_of(kind, signals=["information_gain", "action_gradient"])
     eager, traced = make_batch(weighted=True), make_batch(weighted=True)
     torch.manual_seed(0)
@@ -129,7 +129,7 @@ def test_a_trace_writes_the_same_gain(kind):
     torch.testing.assert_close(traced["signals"], eager["signals"])
 
 
-def test_a_critic_whose_last_layer_gives_more_than_q_is_rejected():
+def test_critic_whose_last_layer_gives_more_than_q_is_rejected():
     class Summed(nn.Module):
         def __init__(self):
             super().__init__()
@@ -178,7 +178,7 @@ def noisy_share(method, *, rows=1_000, updates=300):
     return sum(later) / len(later)
 
 
-def test_the_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
+def test_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
     assert noisy_share("per") > 0.7
     assert 0.4 < noisy_share("uper") < 0.57
     # Without the noise in its denominator it does as PER.

@@ -76,7 +76,7 @@ def test_layers_lead_from_the_observation_to_the_greedy_action(maker):
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_a_spec_of_minus_one_to_one_needs_no_last_layer(maker):
+def test_spec_of_minus_one_to_one_needs_no_last_layer(maker):
     plain = make(maker, None)
     bounded = make(maker, Bounded(low=-1.0, high=1.0, shape=(2,)))
     assert plain.state_dict().keys() == bounded.state_dict().keys()
@@ -84,7 +84,7 @@ def test_a_spec_of_minus_one_to_one_needs_no_last_layer(maker):
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_the_bounds_are_saved_with_the_policy(maker):
+def test_bounds_are_saved_with_the_policy(maker):
     first = make(maker)
     second = make(maker, Bounded(low=-9.0, high=9.0, shape=(2,)))
     second.load_state_dict(first.state_dict())
@@ -110,7 +110,7 @@ def test_random_actions_have_the_density_of_torchrls_distribution():
     assert bool(((sampled >= torch.tensor(LOW)) & (sampled <= torch.tensor(HIGH))).all())
 
 
-def test_the_density_integrates_to_one():
+def test_density_integrates_to_one():
     policy = make_stochastic_actor(1, 1, action_spec=Bounded(low=0.0, high=10.0, shape=(1,)))
     scale = policy.action_scale
     # Of a standard normal, at the actions of a grid: sum the density of equal steps of action.
@@ -184,7 +184,7 @@ def test_learners_train_within_bounds_and_move_no_bound():
         assert scale.half_width.tolist() == [2.0, 5.0]
 
 
-def test_a_spec_may_be_that_of_a_batch_of_environments_or_have_a_key():
+def test_spec_may_be_that_of_a_batch_of_environments_or_have_a_key():
     batched = SPEC.expand(3, 2)
     for spec in (SPEC, batched, Composite(action=SPEC), Composite(action=batched, shape=(3,))):
         low, high = action_bounds(spec, 2)

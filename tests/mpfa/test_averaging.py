@@ -41,7 +41,7 @@ def test_with_one_critic_every_step_is_the_same_as_without_averaging(name):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_target_is_the_mean_over_the_present_and_the_earlier_critics(name):
+def test_target_is_the_mean_over_the_present_and_the_earlier_critics(name):
     learner, batch = make_learner(name, 3), make_batch(seed=20)
     states = []
     for episode in range(5):
@@ -84,7 +84,7 @@ def next_values(name, learner, batch):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_averaged_targets_go_on_from_a_state_that_is_loaded(name):
+def test_averaged_targets_are_saved_and_loaded(name):
     first, second = make_learner(name, 3), make_learner(name, 3, seed=1)
     for seed in range(4):
         first.update(make_batch(seed=seed))

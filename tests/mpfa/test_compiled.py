@@ -86,7 +86,7 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, options):
     ],
     ids=["no weights", "steps", "trust"],
 )
-def test_what_a_batch_may_say_beside_its_transitions_counts(name, more):
+def test_extra_entries_of_a_batch_count_in_a_program(name, more):
     assert_same_gradients(name, {}, make_batch().update(more), loss_function="smooth_l1")
 
 
@@ -107,7 +107,7 @@ def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
     ],
     ids=str,
 )
-def test_a_program_takes_the_same_forty_steps(name, options):
+def test_program_takes_the_same_forty_steps(name, options):
     learners = make_pair(name, **options)
     assert_alike(*learners)
     for seed in range(40):
@@ -125,16 +125,6 @@ def test_a_program_takes_the_same_forty_steps(name, options):
     assert_alike(*learners)
 
 
-@pytest.mark.parametrize("name", ["ddpg", "td3", pytest.param("sac", marks=pytest.mark.slow)])
-def test_batches_for_one_of_both_move_that_one_alone(name):
-    learners = make_pair(name)
-    for seed in range(6):
-        update_both(learners, seed, loss_function="pal")
-        update_both(learners, seed + 50, trains="critic", loss_function="smooth_l1", new_step=False)
-        update_both(learners, seed + 90, trains="actor", new_step=False)
-    assert_alike(*learners)
-
-
 @pytest.mark.parametrize(
     ("name", "through_file", "to_compiled", "updates"),
     [  # Each value of one with each of another.
@@ -145,7 +135,7 @@ def test_batches_for_one_of_both_move_that_one_alone(name):
         ("td3", True, True, 0),
     ],
 )
-def test_a_checkpoint_of_either_goes_on_in_the_other(
+def test_checkpoint_of_an_eager_or_compiled_learner_loads_in_the_other(
     name, through_file, to_compiled, updates, tmp_path
 ):
     first, second = make_pair(name)[:: -1 if not to_compiled else 1]
@@ -183,7 +173,7 @@ def test_policy_and_losses_see_what_the_program_learned(name):
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
-def test_parameters_that_are_laid_elsewhere_are_still_those_that_learn(name):
+def test_parameters_in_other_memory_still_learn(name):
     plain, traced = make_pair(name)
     for learner in (plain, traced):
         learner.loss.load_state_dict(copy.deepcopy(learner.loss.state_dict()))
@@ -238,7 +228,7 @@ def test_networks_that_are_called_with_tensordicts_are_traced_as_well():
     assert_alike(*learners)
 
 
-def test_an_estimator_that_is_made_later_is_that_of_the_next_update():
+def test_estimator_that_is_made_later_is_that_of_the_next_update():
     learners = make_pair("ddpg")
     update_both(learners, 0)
     for learner in learners:
@@ -248,7 +238,7 @@ def test_an_estimator_that_is_made_later_is_that_of_the_next_update():
     assert logs[0]["loss_value"].equal(logs[1]["loss_value"])
 
 
-def test_a_loss_that_depends_on_the_numbers_in_a_batch_cannot_be_a_program():
+def test_loss_that_depends_on_the_numbers_in_a_batch_cannot_be_a_program():
     class Choosing(SignalDDPGLoss):
         def loss_actor(self, tensordict):
             loss, log = super().loss_actor(tensordict)
@@ -260,7 +250,7 @@ def test_a_loss_that_depends_on_the_numbers_in_a_batch_cannot_be_a_program():
     assert learner.updates == 0
 
 
-def test_a_compiler_that_fails_is_not_taken_for_a_batch_that_does_not_fit():
+def test_error_of_the_compiler_is_not_reported_as_one_of_the_batch():
     fail = fail_with(OSError("no compiler"))
     learner = make_learner(compile={"backend": fail})
     with pytest.raises(BackendCompilerFailed, match="no compiler"):
@@ -281,7 +271,7 @@ def test_running_statistics_count_each_batch_once():
     assert max(counts[0]) > 0
 
 
-def test_a_batch_without_entries_is_rejected_as_in_eager():
+def test_batch_without_entries_is_rejected_as_in_eager():
     for learner in make_pair("ddpg"):
         with pytest.raises(KeyError):
             learner.update(TensorDict({}, [8]))
@@ -289,7 +279,7 @@ def test_a_batch_without_entries_is_rejected_as_in_eager():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
-def test_a_compiled_learner_takes_the_same_steps(name):
+def test_compiled_learner_takes_the_same_steps(name):
     learners = make_pair(name, True)
     for seed in range(4):
         update_both(learners, seed, loss_function="pal")

@@ -50,7 +50,7 @@ def network(seed=0):
 
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("importance", ["critic", "torchrl", "none"])
-def test_an_update_of_dqn_is_that_of_a_plain_loop(double, importance):
+def test_update_of_dqn_is_that_of_a_plain_loop(double, importance):
     online, target = network(0), network(0)
     loss = SignalDQNLoss(
         network(0), double=double, gamma=GAMMA, reward_scale=SCALE, importance=importance
@@ -116,7 +116,7 @@ def cell_of(observation):
 
 
 @pytest.mark.parametrize("importance", [True, False])
-def test_an_update_of_the_table_is_that_of_a_plain_dict(importance):
+def test_update_of_the_table_is_that_of_a_plain_dict(importance):
     learner = TabularQLearner(
         make_value_table(cell_of, 3, ACTIONS), lr=0.5, gamma=GAMMA, importance=importance
     )
@@ -148,7 +148,7 @@ def learners():
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_a_learner_goes_on_from_its_state_as_if_nothing_had_been(kind):
+def test_learner_with_a_loaded_state_learns_like_the_saved_one(kind):
     first, second = learners()[kind], learners()[kind]
     assert isinstance(first, Learner)
     first.anneal(0.5)
@@ -165,7 +165,7 @@ def test_a_learner_goes_on_from_its_state_as_if_nothing_had_been(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_a_learner_rejects_what_cannot_be_and_does_not_change(kind):
+def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
     learner = learners()[kind]
     before = copy.deepcopy(learner.state_dict())
     spoiled = transitions()
@@ -239,7 +239,7 @@ def test_every_form_of_an_action_is_learned_from_alike(kind, form):
         lambda hot: hot[:, :1].bool(),
     ],
 )
-def test_what_is_no_action_is_rejected_by_name_and_nothing_changes(kind, spoil):
+def test_bad_action_is_rejected_by_name_and_changes_nothing(kind, spoil):
     learner = learners()[kind]
     before, batch = copy.deepcopy(learner.state_dict()["loss"]), transitions()
     batch["action"] = spoil(batch["action"])
@@ -276,7 +276,7 @@ def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_a_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
+def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     replay = make_replay(
         "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
         generator=torch.Generator().manual_seed(0),
@@ -294,7 +294,7 @@ def test_a_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
 
 
-def test_the_rate_of_a_table_is_the_fraction_that_it_is_told():
+def test_rate_of_a_table_follows_annealing():
     learner = TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
     row = transitions(1).exclude("priority_weight")
     row["next", "reward"][:], row["next", "terminated"][:] = 8.0, True

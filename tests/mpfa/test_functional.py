@@ -59,7 +59,7 @@ def test_each_distance_has_its_value(name, expected):
 
 
 @pytest.mark.parametrize("name", ["smooth_l1", "pal"])
-def test_with_scaled_rewards_the_bend_is_where_it_is_without(name):
+def test_bend_with_scaled_rewards_is_at_the_same_error(name):
     error = torch.randn(20, generator=seeded(1)) * 3
     plain = distance(torch.zeros(20), error, name)
     scaled = distance(torch.zeros(20), 0.1 * error, name, unit=0.1)
@@ -67,7 +67,7 @@ def test_with_scaled_rewards_the_bend_is_where_it_is_without(name):
 
 
 @pytest.mark.parametrize("name", ["smooth_l1", "pal"])
-def test_a_bend_for_each_transition_is_that_of_the_loss_in_its_units(name):
+def test_bend_of_each_transition_equals_one_bend_for_all(name):
     error = torch.randn(20, generator=seeded(1)) * 3
     bend = torch.full((20,), 0.3)
     by_row = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=bend)

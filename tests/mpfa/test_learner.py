@@ -80,7 +80,7 @@ def test_one_update_equals_adam_on_each_loss_alone():
         torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
 
 
-def test_the_critic_is_not_moved_by_the_loss_of_the_actor():
+def test_critic_is_not_moved_by_the_loss_of_the_actor():
     learner = make_learner(critic_weight_decay=0.0)
     of_critic = learner.loss.loss_value
 
@@ -98,7 +98,7 @@ def test_the_critic_is_not_moved_by_the_loss_of_the_actor():
     assert any(not after[n].equal(before[n]) for n in before if n.startswith("actor_network"))
 
 
-def test_an_update_writes_the_signals_and_gives_detached_values():
+def test_update_writes_the_signals_and_gives_detached_values():
     batch = make_batch()
     values = make_learner().update(batch)
     assert {"loss_value", "loss_actor"} <= set(values)
@@ -115,7 +115,7 @@ def test_training_lowers_the_error_of_the_critic_on_a_fixed_batch(kind):
     assert last < 0.2 * first
 
 
-def test_the_policy_acts_with_the_trained_parameters():
+def test_policy_acts_with_the_trained_parameters():
     learner = make_learner()
     batch = make_batch()
     before = learner.policy(batch.select("observation"))["action"]
@@ -127,5 +127,5 @@ def test_the_policy_acts_with_the_trained_parameters():
     assert head.weight.equal(values["actor_network_params.module.head.weight"])
 
 
-def test_the_learner_is_what_a_training_loop_asks_for():
+def test_learner_has_the_methods_of_the_protocol():
     assert isinstance(make_learner(), Learner)

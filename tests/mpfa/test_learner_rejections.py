@@ -44,7 +44,7 @@ def spoiled(entry, value=float("nan")):
     ids=[*IDS, "ddpg traced"],
 )
 @pytest.mark.parametrize("updates", [0, 3])
-def test_a_batch_with_a_number_that_is_none_changes_nothing_and_is_named(name, options, updates):
+def test_batch_with_nan_changes_nothing_and_its_entry_is_named(name, options, updates):
     learner = make_learner(name, updates=updates, **options)
     before = snapshot(learner)
     for entry in ("observation", "action", ("next", "reward"), ("next", "observation")):
@@ -54,7 +54,7 @@ def test_a_batch_with_a_number_that_is_none_changes_nothing_and_is_named(name, o
         assert same(snapshot(learner), before)
 
 
-def test_after_a_rejected_batch_the_next_one_gives_what_it_would_have():
+def test_batch_after_a_rejected_one_has_the_same_effect_as_without():
     learner, other = make_learner("ddpg"), make_learner("ddpg")
     with pytest.raises(ValueError, match="batch must be finite"):
         learner.update(spoiled("observation"))
@@ -65,7 +65,7 @@ def test_after_a_rejected_batch_the_next_one_gives_what_it_would_have():
 
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
 @pytest.mark.parametrize("trains", ["critic", "actor"])
-def test_a_batch_for_one_of_them_alone_is_rejected_alike(name, options, trains):
+def test_batch_with_infinity_for_critic_or_actor_alone_is_rejected(name, options, trains):
     learner = make_learner(name, **options)
     batch = SampledBatch(spoiled("observation", float("inf")), trains=trains)
     with rejected(learner, ValueError, "batch must be finite, got inf in 'observation'"):
@@ -73,14 +73,14 @@ def test_a_batch_for_one_of_them_alone_is_rejected_alike(name, options, trains):
 
 
 @pytest.mark.parametrize("trains", ["critics", "", None, ["actor"]])
-def test_a_batch_for_a_network_that_there_is_not_is_rejected(trains):
+def test_batch_for_an_unknown_network_is_rejected(trains):
     words = re.escape(f"trains must be one of ('both', 'critic', 'actor'), got {trains!r}")
     with pytest.raises(ValueError, match=words):
         SampledBatch(make_batch(), trains=trains)
 
 
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
-def test_a_batch_without_an_entry_changes_nothing(name, options):
+def test_batch_without_an_entry_changes_nothing(name, options):
     learner = make_learner(name, **options)
     before = snapshot(learner)
     for entry in ("action", ("next", "reward"), ("next", "terminated")):
@@ -91,7 +91,7 @@ def test_a_batch_without_an_entry_changes_nothing(name, options):
 
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
 @pytest.mark.parametrize("entry", ["observation", "action", ("next", "observation")])
-def test_a_batch_that_does_not_fit_the_networks_is_named_and_changes_nothing(name, options, entry):
+def test_batch_that_does_not_fit_the_networks_is_named_and_changes_nothing(name, options, entry):
     learner, batch = make_learner(name, **options), make_batch()
     before = snapshot(learner)
     for wrong in (torch.cat([batch[entry]] * 2, -1), batch[entry].double()):
@@ -101,14 +101,14 @@ def test_a_batch_that_does_not_fit_the_networks_is_named_and_changes_nothing(nam
         assert same(snapshot(learner), before)
 
 
-def test_a_batch_that_does_not_fit_a_network_of_discrete_actions_is_named():
+def test_batch_that_does_not_fit_a_network_of_discrete_actions_is_named():
     learner, batch = make_discrete(9), make_batch()
     batch["action"] = torch.eye(4)[torch.zeros(len(batch), dtype=torch.long)]
     with pytest.raises(RuntimeError, match=r"batch does not fit the loss, got 'observation' \["):
         learner.update(batch)
 
 
-def test_rewards_that_overflow_the_loss_are_told_from_rewards_that_are_none():
+def test_loss_that_overflows_is_rejected_as_a_loss_and_not_as_a_batch():
     learner = make_learner("ddpg")
     with rejected(learner, ValueError, "loss_value must be finite, got inf of a finite batch"):
         learner.update(spoiled(("next", "reward"), 1e30))

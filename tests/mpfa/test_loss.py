@@ -57,7 +57,7 @@ class LinearCritic(nn.Module):
         return self.of_state * observation + self.of_action * action
 
 
-def test_a_network_of_two_lines_gives_the_numbers_of_a_hand_calculation():
+def test_network_of_two_lines_gives_the_numbers_of_a_hand_calculation():
     actor = TensorDictModule(ConstantActor(), ["observation"], ["action"])
     critic = TensorDictModule(LinearCritic(), ["observation", "action"], ["state_action_value"])
     loss = make_ddpg_loss(actor, critic, gamma=0.5, loss_function="l2")
@@ -173,7 +173,7 @@ def test_weights_may_be_a_column():
     assert loss(batch)["loss_value"].equal(expected)
 
 
-def test_an_end_is_not_bootstrapped_and_a_time_limit_is():
+def test_end_is_not_bootstrapped_and_a_time_limit_is():
     batch = make_batch()
     ended, limited, neither = batch.clone(), batch.clone(), batch.clone()
     true, false = torch.ones(6, 1, dtype=torch.bool), torch.zeros(6, 1, dtype=torch.bool)
@@ -225,7 +225,7 @@ def test_no_gradient_reaches_the_batch_and_only_signals_are_added(kind):
 
 @pytest.mark.parametrize("importance", ["critic", "torchrl"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_losses_of_an_update_are_those_that_torchrl_asks_for(kind, importance):
+def test_losses_of_an_update_are_those_that_torchrl_asks_for(kind, importance):
     loss = make_of(kind, importance=importance, saturation_penalty=0.1, saturation_limit=0.1)
     expected = evaluate(loss, make_batch(weighted=True))
     torch.manual_seed(1)
@@ -237,7 +237,7 @@ def test_the_losses_of_an_update_are_those_that_torchrl_asks_for(kind, importanc
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_loss_can_be_looked_at_without_gradients(kind):
+def test_loss_under_no_grad_equals_the_loss_with_gradients(kind):
     batch, expected, name = make_batch(), make_batch(), CRITICS_LOSS[kind]
     with_grad = evaluate(make_of(kind), expected)
     with torch.no_grad():
@@ -248,11 +248,11 @@ def test_a_loss_can_be_looked_at_without_gradients(kind):
         torch.testing.assert_close(batch["signals", key], expected["signals", key])
 
 
-def test_the_value_estimator_is_one_step_if_none_is_made():
+def test_value_estimator_is_one_step_if_none_is_made():
     assert SignalDDPGLoss(*make_networks())(make_batch())["loss_value"].isfinite()
 
 
-def test_an_actor_may_observe_what_the_critic_does_not():
+def test_actor_may_observe_what_the_critic_does_not():
     actor = TensorDictModule(nn.Linear(5, 2), ["image"], ["action"])
     loss = make_ddpg_loss(actor, make_networks()[1], gamma=GAMMA)
     batch = make_batch()
@@ -312,7 +312,7 @@ def test_every_key_may_be_nested_and_renamed():
     # What TorchRL makes of several critics cannot be pickled.
     [("ddpg", "pickle"), *itertools.product(KINDS, ["deepcopy", "double"])],
 )
-def test_a_copied_or_converted_loss_uses_its_own_parameters(kind, path):
+def test_copied_or_converted_loss_uses_its_own_parameters(kind, path):
     loss, name = make_of(kind), CRITICS_LOSS[kind]
     before = evaluate(loss, make_batch())
     if path == "double":
@@ -337,13 +337,13 @@ def test_a_copied_or_converted_loss_uses_its_own_parameters(kind, path):
     "key", ["observation", "action", "next", ("next", "reward"), ("next", "terminated")], ids=str
 )
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_input_is_named(kind, key):
+def test_missing_input_is_named(kind, key):
     with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
         make_of(kind)(make_batch().exclude(key))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.7])
-def test_the_exponent_of_pal_reaches_the_loss(alpha):
+def test_exponent_of_pal_reaches_the_loss(alpha):
     loss, batch = make_loss(loss_function="pal", pal_alpha=alpha), make_batch()
     batch["next", "reward"] *= 5.0
     found = loss(batch)
@@ -361,7 +361,7 @@ def test_loss_bends_at_one_in_units_of_the_reward(name):
     assert not torch.allclose(found["loss_value"], other.mean())
 
 
-def test_an_action_spec_takes_the_place_of_bounds():
+def test_action_spec_takes_the_place_of_bounds():
     spec = Bounded(low=-0.5, high=0.5, shape=(2,))
     loss = SignalTD3Loss(*make_networks(), action_spec=spec)
     assert loss.max_action.tolist() == [0.5, 0.5]
@@ -369,7 +369,7 @@ def test_an_action_spec_takes_the_place_of_bounds():
     assert SignalTD3Loss(*make_networks(), bounds=(low, high)).max_action.tolist() == [2.0, 10.0]
 
 
-def test_the_critics_of_td3_start_apart():
+def test_critics_of_td3_start_apart():
     params = make_of("td3").qvalue_network_params.flatten_keys()
     weights = [value for name, value in params.items() if name.endswith("weight")]
     assert any(not value[0].equal(value[1]) for value in weights)

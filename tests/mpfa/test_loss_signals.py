@@ -38,7 +38,7 @@ def value_loss(kind, batch, seed=1, **options):
 
 
 @pytest.mark.parametrize("order", [2.0, 1.0, math.inf])
-def test_the_gradient_signal_equals_the_gradient_row_by_row(order):
+def test_gradient_signal_equals_the_gradient_row_by_row(order):
     actor, critic = make_networks()
     plain = copy.deepcopy(critic).module
     loss = make_ddpg_loss(actor, critic, gamma=GAMMA, gradient_order=order)
@@ -131,7 +131,7 @@ def test_errors_stay_in_units_of_the_reward_when_the_loss_scales_it(kind):
     ],
     ids=str,
 )
-def test_a_deferred_gradient_equals_that_of_a_backward_pass_of_its_own(kind, options):
+def test_deferred_gradient_equals_that_of_a_backward_pass_of_its_own(kind, options):
     direct, deferred = make_batch(), make_batch()
     value_loss(kind, direct, of_loss=options)
     loss, total = value_loss(kind, deferred, defer_gradient=True, of_loss=options)
@@ -145,7 +145,7 @@ def test_a_deferred_gradient_equals_that_of_a_backward_pass_of_its_own(kind, opt
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_transition_without_error_has_its_gradient_too(kind):
+def test_transition_without_error_has_its_gradient_too(kind):
     direct, deferred = make_batch(), make_batch()
     value_loss(kind, direct)
     # A weight of zero takes the transition out of the loss, as an error of zero would.
@@ -158,7 +158,7 @@ def test_a_transition_without_error_has_its_gradient_too(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_deferred_gradient_waits_for_the_backward_pass_and_for_no_copy(kind):
+def test_deferred_gradient_waits_for_the_backward_pass_and_for_no_copy(kind):
     batch = make_batch()
     loss, _ = value_loss(kind, batch, defer_gradient=True)
     copy.deepcopy(loss).write_action_gradient(batch)
@@ -176,7 +176,7 @@ def test_under_no_grad_the_gradient_is_written_at_once(kind):
 
 
 @pytest.mark.parametrize("kind", ["ddpg", "td3"])
-def test_a_learner_writes_the_gradient_of_the_critic_before_its_step(kind):
+def test_learner_writes_the_gradient_of_the_critic_before_its_step(kind):
     expected, batch = make_batch(), make_batch()
     value_loss(kind, expected)
     ActorCriticLearner(make_of(kind), critic_lr=0.1).update(batch)
@@ -188,7 +188,7 @@ def test_a_learner_writes_the_gradient_of_the_critic_before_its_step(kind):
 
 @pytest.mark.parametrize("direct", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_saturation_penalty_is_the_mean_square_of_what_exceeds_the_limit(kind, direct):
+def test_saturation_penalty_is_the_mean_square_of_what_exceeds_the_limit(kind, direct):
     found = []
     for penalty in (0.0, 2.0):
         networks = make_networks(stochastic=kind == "sac")
@@ -203,7 +203,7 @@ def test_the_saturation_penalty_is_the_mean_square_of_what_exceeds_the_limit(kin
     assert found[1] - found[0] == pytest.approx(2.0 * sum(excess) / 12, rel=1e-4, abs=1e-6)
 
 
-def test_the_saturation_penalty_pulls_preactivations_back_and_leaves_small_ones_alone():
+def test_saturation_penalty_pulls_preactivations_back_and_leaves_small_ones_alone():
     def bias_gradient(limit):
         loss = make_loss(saturation_penalty=1.0, saturation_limit=limit)
         plain = make_loss()
@@ -221,7 +221,7 @@ def test_the_saturation_penalty_pulls_preactivations_back_and_leaves_small_ones_
     torch.testing.assert_close(bias_gradient(100.0), torch.zeros(2))
 
 
-def test_a_penalty_on_an_actor_without_preactivation_is_an_error():
+def test_penalty_on_an_actor_without_preactivation_is_an_error():
     actor = TensorDictModule(nn.Linear(5, 2), ["observation"], ["action"])
     loss = make_ddpg_loss(actor, make_networks()[1], gamma=GAMMA, saturation_penalty=0.1)
     with pytest.raises(KeyError, match=r"saturation_penalty is 0.1, but the actor writes no"):

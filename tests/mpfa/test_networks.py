@@ -22,7 +22,7 @@ def test_shapes_follow_the_batch(batch_size):
     assert data["state_action_value"].shape == (*batch_size, 1)
 
 
-def test_the_action_is_the_tanh_of_the_preactivation():
+def test_action_is_the_tanh_of_the_preactivation():
     observation = torch.randn(50, 7, generator=seeded()) * 20
     before, action = make_actor(7, 2, final_init=None).module(observation)
     assert action.equal(torch.tanh(before))
@@ -45,7 +45,7 @@ def test_last_layers_start_near_zero_and_hence_actions_near_the_middle():
 
 
 @pytest.mark.parametrize("layers", [2, 3, 4])
-def test_the_number_of_hidden_layers_and_units_is_as_asked(layers):
+def test_number_of_hidden_layers_and_units_is_as_asked(layers):
     for module in (
         make_actor(7, 2, width=9, layers=layers),
         make_critic(7, 2, width=9, layers=layers),
@@ -56,7 +56,7 @@ def test_the_number_of_hidden_layers_and_units_is_as_asked(layers):
         assert count(module, nn.LayerNorm) == layers
 
 
-def test_the_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
+def test_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
     plain = {"layer_norm": False, "final_init": None}
     actor, critic = make_actor(7, 2, **plain), make_critic(7, 2, late_action=False, **plain)
     assert count(actor, nn.LayerNorm) == count(critic, nn.LayerNorm) == 0
@@ -66,14 +66,14 @@ def test_the_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
     assert count(one_layer, nn.Linear) == 2
 
 
-def test_a_late_action_joins_at_the_second_layer():
+def test_late_action_joins_at_the_second_layer():
     critic = make_critic(7, 2, width=11).module
     assert critic.first[0].in_features == 7
     assert critic.rest[0].in_features == 13
 
 
 @pytest.mark.parametrize("late_action", [True, False])
-def test_the_value_depends_on_observation_and_action(late_action):
+def test_value_depends_on_observation_and_action(late_action):
     critic = make_critic(7, 2, late_action=late_action, final_init=None).module
     observation, action = torch.randn(4, 7, generator=seeded()), torch.zeros(4, 2)
     value = critic(observation, action)

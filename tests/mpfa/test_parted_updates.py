@@ -52,7 +52,7 @@ def after_some_updates(name, **options):
 
 @pytest.mark.parametrize("fresh", [True, False], ids=["first", "later"])
 @pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
-def test_an_update_of_the_critics_alone_leaves_actor_and_targets_to_the_bit(name, options, fresh):
+def test_update_of_the_critics_alone_leaves_actor_and_targets_to_the_bit(name, options, fresh):
     learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
     before, batch = parts(learner), make_batch(seed=7)
     log = learner.update(SampledBatch(batch, trains="critic", new_step=False))
@@ -67,7 +67,7 @@ def test_an_update_of_the_critics_alone_leaves_actor_and_targets_to_the_bit(name
 
 @pytest.mark.parametrize("fresh", [True, False], ids=["first", "later"])
 @pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
-def test_an_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, options, fresh):
+def test_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, options, fresh):
     learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
     before, batch = parts(learner), make_batch(seed=7)
     entries = set(batch.keys(True, True))
@@ -86,7 +86,7 @@ def test_an_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, option
 @pytest.mark.parametrize(
     ("name", "options"), [("ddpg", {}), ("td3", {}), ("ddpg", UNTRACED), ("td3", UNTRACED)], ids=str
 )
-def test_the_actor_moves_as_in_an_update_of_both(name, options):
+def test_actor_moves_as_in_an_update_of_both(name, options):
     """All gradients of an update are taken at the same networks, so that its halves are alike."""
     both, alone = (after_some_updates(name, **options) for _ in range(2))
     for learner, trains in ((both, "both"), (alone, "actor")):
@@ -96,7 +96,7 @@ def test_the_actor_moves_as_in_an_update_of_both(name, options):
         torch.testing.assert_close(found[key], value, rtol=1e-5, atol=1e-7)
 
 
-def test_a_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
+def test_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
     learner, other = (after_some_updates("sac") for _ in range(2))
     torch.manual_seed(3)
     learner.update(SampledBatch(make_batch(seed=7), trains="actor"))
@@ -109,7 +109,7 @@ def test_a_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
 @pytest.mark.parametrize("options", [{}, UNTRACED], ids=["plain", "pure"])
-def test_a_delayed_actor_waits_for_its_training_step_whichever_batch_it_is_in(name, options):
+def test_delayed_actor_waits_for_its_training_step_whichever_batch_it_is_in(name, options):
     delay = {"policy_delay": 2} if name == "ddpg" else {}  # TD3's is two.
     learner = make_learner(name, **delay, **options)
     step = (("both", True), ("critic", False), ("actor", False))
@@ -128,7 +128,7 @@ def test_a_delayed_actor_waits_for_its_training_step_whichever_batch_it_is_in(na
     assert found == [*waiting, both, critic_alone, actor_alone] * 2
 
 
-def test_an_actors_batch_that_begins_a_step_counts_even_if_nothing_is_due():
+def test_actors_batch_that_begins_a_step_counts_even_if_nothing_is_due():
     learner = make_learner("td3", policy_delay=2)
     assert learner.update(SampledBatch(make_batch(), trains="actor")) == {}
     assert "loss_actor" in learner.update(SampledBatch(make_batch(), trains="actor"))
@@ -147,7 +147,7 @@ def train(learner, steps, begin=0):
 
 
 @pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
-def test_a_learner_goes_on_where_it_was_saved_in_the_middle_of_a_step(name, options):
+def test_learner_loaded_in_the_middle_of_a_step_learns_like_the_saved_one(name, options):
     first, second = make_learner(name, **options), make_learner(name, seed=1, **options)
     train(first, 3)
     train(second, 1)
@@ -161,7 +161,7 @@ def test_a_learner_goes_on_where_it_was_saved_in_the_middle_of_a_step(name, opti
     assert same(first.state_dict(), second.state_dict())
 
 
-def test_an_update_that_failed_halfway_leaves_no_signals_to_the_next_one(monkeypatch):
+def test_update_that_failed_halfway_leaves_no_signals_to_the_next_one(monkeypatch):
     learner = make_learner("ddpg")
 
     def fail(losses):

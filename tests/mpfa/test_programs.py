@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 
 @pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
-def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
+def test_traced_program_takes_the_same_steps_and_is_made_once_for_all_rates(name):
     made = []
     options = {"target_average": 2} if name == "ddpg" else {}
     learners = make_pair(name, counting(made), loss=options)
@@ -31,7 +31,7 @@ def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
 
 
 @pytest.mark.parametrize("name", ["ddpg", pytest.param("sac", marks=pytest.mark.slow)])
-def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name):
+def test_learners_of_equal_settings_share_programs_and_learn_as_alone(name):
     made, others = [], []
     shared, own = counting(made), counting(others)
     learners = [make_learner(name, seed, compile=shared) for seed in range(2)]
@@ -57,7 +57,7 @@ def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name)
     ],
     ids=lambda options: "-".join(options),
 )
-def test_learners_of_other_settings_learn_as_each_alone(options):
+def test_learners_of_other_settings_learn_as_alone(options):
     made = []
     shared = counting(made)
     first = make_learner(compile=shared)
@@ -89,7 +89,7 @@ def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, mo
         make_pair("ddpg")
 
 
-def test_where_the_user_has_no_folder_programs_stay_where_pytorch_has_them(tmp_path, monkeypatch):
+def test_programs_without_a_folder_of_the_user_stay_in_that_of_pytorch(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
@@ -106,7 +106,7 @@ def change_gamma(loss):
 
 
 @pytest.mark.parametrize("change", [change_reward, change_gamma])
-def test_a_program_is_made_again_for_a_loss_that_is_changed(change):
+def test_program_is_made_again_for_a_loss_that_is_changed(change):
     learners = make_pair("ddpg")
     for seed in range(4):
         if seed == 2:
@@ -120,7 +120,7 @@ def test_a_program_is_made_again_for_a_loss_that_is_changed(change):
     assert_alike(*learners)
 
 
-def test_a_program_is_made_again_for_another_precision():
+def test_program_is_made_again_for_another_precision():
     learners = make_pair("ddpg")
     for seed in range(4):
         with torch.autocast("cpu", torch.bfloat16, enabled=seed < 2):

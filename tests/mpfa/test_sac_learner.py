@@ -20,7 +20,7 @@ def make_learner(seed=0, *, of_loss=None, **options):
     )
 
 
-def test_the_target_may_average_over_earlier_critics():
+def test_target_may_average_over_earlier_critics():
     learner = make_learner(of_loss={"target_average": 2}, critic_lr=1e-2, tau=0.5)
     learner.end_episode()
     states = [deepcopy(learner.loss.target_qvalue_network_params)]
@@ -38,9 +38,7 @@ def test_the_target_may_average_over_earlier_critics():
 
 
 @pytest.mark.parametrize(("deviation", "falls"), [(1.0, True), (0.01, False)])
-def test_the_temperature_falls_while_the_entropy_is_above_its_target_and_rises_below(
-    deviation, falls
-):
+def test_temperature_falls_while_the_entropy_is_above_its_target_and_rises_below(deviation, falls):
     learner = make_learner(alpha_lr=1e-2, actor_lr=1e-8)
     head = learner.policy.module[0].module.scale_head
     torch.nn.init.zeros_(head.weight)
@@ -51,7 +49,7 @@ def test_the_temperature_falls_while_the_entropy_is_above_its_target_and_rises_b
     assert log[0]["alpha"] == 1.0
 
 
-def test_a_fixed_temperature_stays():
+def test_fixed_temperature_stays():
     learner = make_learner(of_loss={"fixed_alpha": True, "alpha_init": 0.2})
     for seed in range(3):
         log = learner.update(make_batch(seed=seed))
@@ -59,7 +57,7 @@ def test_a_fixed_temperature_stays():
     assert len(learner.optimizer.param_groups) == 2
 
 
-def test_an_update_moves_everything_but_the_target_critics_follow_by_tau():
+def test_update_moves_everything_but_the_target_critics_follow_by_tau():
     learner = make_learner(tau=0.1)
     values = {**dict(learner.loss.named_parameters()), **dict(learner.loss.named_buffers())}
     before = {name: value.detach().clone() for name, value in values.items()}
@@ -77,7 +75,7 @@ def test_an_update_moves_everything_but_the_target_critics_follow_by_tau():
         torch.testing.assert_close(values[name], expected.detach())
 
 
-def test_the_temperature_moves_with_the_actor():
+def test_temperature_moves_with_the_actor():
     learner = make_learner()
     found = [learner.loss.log_alpha.item()]
     for trains in ("critic", "actor"):
@@ -86,7 +84,7 @@ def test_the_temperature_moves_with_the_actor():
     assert found[0] == found[1] != found[2]
 
 
-def test_the_temperature_has_a_rate_of_its_own_that_is_annealed_too():
+def test_temperature_has_a_rate_of_its_own_that_is_annealed_too():
     learner = make_learner()
     learner.anneal(0.5)
     assert [group["lr"] for group in learner.optimizer.param_groups] == [5e-4, 5e-4, 1.5e-4]
@@ -118,11 +116,11 @@ def test_learning_finds_the_best_action_at_the_entropy_that_is_asked_for():
 
 
 @pytest.mark.parametrize("rate", ["actor_lr", "critic_lr"])
-def test_without_one_of_its_networks_it_does_not(rate):
+def test_learning_without_one_of_the_networks_does_not_find_it(rate):
     assert solve_bandit(**{rate: 1e-9})[0] > 0.3
 
 
-def test_its_signals_are_what_a_replay_of_several_signals_reads():
+def test_signals_of_sac_are_read_by_a_replay_of_several_signals():
     buffer, learner = make_buffer(16, 8), make_learner()
     buffer.extend(make_batch(16))
     for _ in range(3):

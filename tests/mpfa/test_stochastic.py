@@ -9,7 +9,7 @@ from tests.mpfa.losses import make_batch, make_networks
 from torchrl_mpfa.networks import sample_tanh_normal
 
 
-def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
+def test_policy_is_the_tanh_of_its_mean_unless_it_explores():
     policy, _ = make_networks(stochastic=True)
     observed = make_batch().select("observation")
     found = policy.outputs(observed)
@@ -26,7 +26,7 @@ def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
     assert not sampled[0].equal(found["action"])
 
 
-def test_the_sizes_of_a_policy_can_be_read_from_its_weights():
+def test_sizes_of_a_policy_can_be_read_from_its_weights():
     weights = [
         value
         for value in make_networks(stochastic=True)[0].state_dict().values()

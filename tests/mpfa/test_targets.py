@@ -79,7 +79,7 @@ def test_targets_of_several_steps_are_those_of_torchrls_loss(name, options, colu
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
-def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
+def test_target_of_several_steps_is_its_formula_row_by_row(name):
     batch = of_several_steps(done_keys=["done"])
     _, loss = make_pair(name)
     networks = loss._networks()
@@ -103,7 +103,7 @@ def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
 
 @torch.no_grad()
 @pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_the_target_of_sac_is_soft_row_by_row(scale):
+def test_target_of_sac_is_soft_row_by_row(scale):
     loss = make_of("sac", reward_scale=scale, signals=["td_error", "value"], gamma=0.9)
     batch = make_batch()
     torch.manual_seed(1)
@@ -174,7 +174,7 @@ def test_ends_that_are_numbers_count_as_booleans(name, estimator, dtype):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_an_estimator_may_be_given_as_it_is(name):
+def test_estimator_object_equals_the_estimator_by_name(name):
     _, by_name = make_pair(name, ValueEstimators.TDLambda, lmbda=0.7)
     _, given = make_pair(name)
     made = TDLambdaEstimator(gamma=GAMMA, lmbda=0.7, value_network=None)
@@ -184,7 +184,7 @@ def test_an_estimator_may_be_given_as_it_is(name):
     torch.testing.assert_close(found, expected)
 
 
-def test_the_target_of_ddpg_is_at_an_action_with_noise_within_the_bounds():
+def test_target_of_ddpg_is_at_an_action_with_noise_within_the_bounds():
     noisy = {"policy_noise": 0.8, "noise_clip": 0.6, "bounds": (-0.5, 0.5), "gamma": GAMMA}
     loss, batch = make_of("ddpg", **noisy), make_batch()
     torch.manual_seed(3)
