@@ -347,7 +347,7 @@ class SignalLoss(HoldsNetworks):
         self, batch: TensorDictBase, value: Tensor, td_error: Tensor, action: Tensor, defer: bool
     ) -> None:
         """Write ``|TD error|`` (Eq. 13), the largest of the critics, the slope (Eq. 14), and Q."""
-        keys = self.tensor_keys
+        keys, self._deferred = self.tensor_keys, None
         if TD_ERROR.name in self.signals:
             size = td_error_priority(td_error).amax(0)
             batch.set(keys.td_error_signal, size / self.reward_scale)
