@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,13 +56,20 @@ class CompiledGradients:
         self._loss = loss
         self._arguments = compile
         self._programs: dict[Any, Program] = {}
+        self._device = next(loss.parameters()).device.type
+        self._held: list[Any] = []
+        self._options: tuple[Any, ...] = ()
 
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         """Set gradients and write signals like losses and a backward pass; return the log."""
         entries = self._entries(batch)
-        form = trains, loss_function, self._options(), *map(_form, entries.items())
+        self._read_options()
+        precision = torch.is_autocast_enabled(self._device) and torch.get_autocast_dtype(
+            self._device
+        )
+        form = trains, loss_function, precision, self._options, *map(_form, entries.items())
         program = self._programs.get(form)
         if program is None:
             made = self._make(entries, batch.batch_size[:1], trains, loss_function)
@@ -83,16 +91,18 @@ class CompiledGradients:
         # A program is for one layout, which a slice of another tensor has not.
         return {k: v.contiguous() for k, v in found if isinstance(v, Tensor) and k not in written}
 
-    def _options(self) -> tuple[Any, ...]:
-        """Return the constants of a trace: options, keys, estimator of the targets, precision."""
-        estimator = self._loss.value_estimator
-        keys = self._loss.tensor_keys, estimator.tensor_keys
-        held = [v for each in (self._loss, estimator, *keys) for v in vars(each).values()]
+    def _read_options(self) -> None:
+        """Read the constants of a trace again if one may have changed: options, keys, estimator."""
+        loss, estimator = self._loss, self._loss.value_estimator
+        parts = loss, estimator, loss.tensor_keys, estimator.tensor_keys
+        held = [estimator, *estimator._buffers.values()]
+        for part in parts:
+            held += vars(part).values()
+        if len(held) == len(self._held) and all(map(is_, held, self._held)):
+            return
+        self._held = held
         plain = [value for value in held if isinstance(value, (bool, int, float, str, tuple))]
-        tensors = [id(value) for value in estimator.buffers()]
-        device = next(self._loss.parameters()).device.type
-        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
-        return estimator, autocast, *tensors, *plain
+        self._options = estimator, *map(id, estimator.buffers()), *plain
 
     def _make(
         self,
