@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from mpfa_envs.checks import check_number, check_positive
-from mpfa_envs.paths.field_loops import BEYOND, path_lengths
+from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import (
     MOVES,
     STEP_SCALE,
@@ -226,8 +226,6 @@ class DistanceField:
         i, j = (-1, -1) if until is None else np.subtract(grid.index(*until), self.first).tolist()
         self.lengths = path_lengths(free, seeds[inside], gaps[inside], MOVES, step, limit, (i, j))
         """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
-        if 0 <= i < len(free) and 0 <= j < free.shape[1]:
-            self.lengths[self.lengths > self.lengths[i, j] + BEYOND * step] = math.inf
 
     @property
     def origin(self) -> tuple[float, float]:

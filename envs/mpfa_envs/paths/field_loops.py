@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.compiled import njit
 
-BEYOND: Final = 3.0
+_BEYOND: Final = 3.0
 """Steps by which the last cell that is needed is exceeded: more than a move is long."""
 _BUCKETS: Final = 8
 """Number of buckets; a move leads three ahead at most."""
@@ -25,7 +25,7 @@ def path_lengths(
     moves: NDArray[np.int64],
     step: float,  # [m]
     limit: float,  # [m]
-    last: tuple[int, int] = (-1, -1),  # Lengths beyond this cell's may be too long.
+    last: tuple[int, int] = (-1, -1),  # Cells much farther than this one are left out.
 ) -> NDArray[np.float64]:
     """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
     # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
@@ -61,7 +61,7 @@ def path_lengths(
             continue
         settled[i, j] = True
         if i == last[0] and j == last[1]:
-            limit = min(limit, lengths_to[i, j] + BEYOND * step)
+            limit = min(limit, lengths_to[i, j] + _BEYOND * step)
         if entries + len(moves) > len(cells):
             cells = np.concatenate((cells, cells))
             nexts = np.concatenate((nexts, nexts))
