@@ -79,7 +79,7 @@ def train(env: EnvBase, *, replay: str, actions: int) -> MLP:
     """Learn, and say now and then what share of the last hundred episodes reached the goal.
 
     Args:
-        env: The robots, which tell ``("info", "success")``.
+        env: The robots, which report ``("info", "success")``.
         replay: ``uniform`` or ``mpfa``.
         actions: Of all robots together.
 

@@ -9,7 +9,7 @@
 Settings are of all trials, before the options or after ``--``. Optuna's TPE suggests what is tried
 next from what was found; a trial that is worse than half of those at their end were after as many
 evaluations is pruned. It can be stopped or killed at any moment and continued by the same command,
-or with more ``--trials``: what is done stays done, and what was under way goes on from its last
+or with more ``--trials``: finished trials stay, and trials in progress resume from their last
 checkpoint.
 
 A trial of the default 50,000 actions takes some one and a half minutes of a core, one that is

@@ -52,7 +52,7 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "memory": settings.memory,
         "history": settings.history,
         **seen,
-        # The lidar saturates where the training ends an episode, and tells all distances above; a
+        # The lidar saturates where the training ends an episode, and shows all distances above; a
         # robot that can stop may drive on from there, and must know how near it is.
         "closeness_distance": robot.radius if robot.can_stop else collision_distance(settings),
     }

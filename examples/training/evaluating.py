@@ -113,7 +113,7 @@ def drive(
     if physics is not None:
         arguments["physics"] = physics
     sets = [tasks_of(policy, [each], episodes=episodes, seed=seed) for each in worlds]
-    # A robot goes on with the next world while the slowest ones of this are under way. Robots on
+    # A robot continues with the next world while the slowest of this one still drive. Robots on
     # wheels that share a physics server must be the same ones as if there was no other world.
     apart = arguments.get("physics") != "kinematic" and max(map(len, sets)) > SERVERS
     driven: list[Drives] = []

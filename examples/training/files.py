@@ -26,7 +26,7 @@ PREVIOUS = "previous"
 """Folder of the files of an earlier run in the same folder."""
 _LOCK = ".lock"
 _TABLES = (EPISODES, EVALUATIONS, UPDATES)
-# The checkpoint first: once it is gone, nothing can go on with the old run.
+# The checkpoint first: once it is gone, nothing can resume the old run.
 _OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS, CSV, TENSORBOARD)
 
 

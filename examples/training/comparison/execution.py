@@ -205,7 +205,7 @@ class Runs(Work[Job]):
         anew: set[Job],
         workers: Sequence[Worker],
     ) -> None:
-        # The average of the runs that are done tells how long the others will take.
+        # The average of the runs that are done shows how long the others will take.
         bar = tqdm(desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False)
         super().__init__(waiting, workers, bar)
         self.overrides, self.wanted, self.anew = overrides, wanted, anew

@@ -241,7 +241,7 @@ def _interval(ours: Array, theirs: Array | None = None) -> str:
     sides = [ours] if theirs is None else [ours, theirs]
     if min(map(len, sides)) < 2:
         return "one run"
-    # Runs that all end alike, at 0 % or 100 % as a rule, do not tell how much others differ.
+    # Runs that all end alike, at 0 % or 100 % as a rule, do not show how much others differ.
     if not any(np.ptp(each) for each in sides):
         return "none, no spread"
     if theirs is None:

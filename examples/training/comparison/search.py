@@ -344,7 +344,7 @@ def write_results(study: optuna.Study, plan: Plan, folder: Path) -> None:
 
 def _importances(study: optuna.Study) -> dict[str, float]:
     """Return the importance of each setting by PED-ANOVA; empty for few trials."""
-    # Optuna leaves out pruned trials, by which an important setting is told: they are not the best.
+    # Optuna leaves out pruned trials, but these show what matters: they are not the best.
     trials = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE, TrialState.PRUNED])
     if len(trials) < 2 * _BEST_TRIALS:
         return {}

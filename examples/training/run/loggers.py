@@ -1,7 +1,7 @@
 """TorchRL's loggers that write to the folder of a run; a resumed run begins no second log.
 
 A resumed run logs again what was logged after its checkpoint. Of a CSV file those
-rows are removed, and TensorBoard is told to forget them.
+rows are removed, and TensorBoard hides them.
 """
 
 from __future__ import annotations

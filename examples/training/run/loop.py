@@ -180,8 +180,8 @@ class TrainingRun:
     def _call(self, *events: tuple[Any, ...]) -> None:
         """Call all events of a hook, by name and with their arguments, then those of the next."""
         for hook in self.hooks:
-            for name, *told in events:
-                getattr(hook, name)(self, *told)
+            for name, *arguments in events:
+                getattr(hook, name)(self, *arguments)
 
     def _iterate(self) -> None:
         """One action of each robot, and the updates for them."""
@@ -208,11 +208,11 @@ class TrainingRun:
             self._events.append(("on_episode", record))
         if self.crossed(self.settings.evaluation.every):
             self._evaluate()
-        # Only now: a run that a hook ends goes on as if it had been stopped.
+        # Only now: a run that a hook ends resumes as if it had been stopped.
         self._call(*self._events)
         if self.crossed(self.settings.tracking.pictures_every or 0):
             show_policy(self)
-        # Last: a run that an error ends before here begins the stage when it goes on.
+        # Last: a run that an error ends before here begins the stage when it resumes.
         self._advance()
         self._anneal()
 

@@ -24,7 +24,7 @@ class WandbLog:
     """A W&B run that keeps its id when training is resumed.
 
     What a run does again after a checkpoint is logged once: how far it was logged is in a file,
-    since wandb does not tell it of an offline run.
+    since wandb does not report it for an offline run.
 
     Args:
         settings: Of the run, its configuration.
