@@ -74,7 +74,8 @@ def test_a_path_is_as_long_as_that_of_the_grid(name: str, world: str) -> None:
 def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25)
     start, goal = (-4.0, -4.0), (4.0, 4.0)
-    neighbors, _ = moves_of_cells(grid)
+    neighbors, lengths = moves_of_cells(grid)
+    np.testing.assert_array_equal(neighbors < len(grid.cells), np.isfinite(lengths))
     number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
     for search in (astar_path, dijkstra_path, AntColony(ants=4, iterations=2)):
         path = search(grid, start, goal)
