@@ -77,12 +77,16 @@ _KIND, _OUTCOMES = "MPFA_UPSTREAM_KIND", "MPFA_UPSTREAM_OUTCOMES"
 
 def pytest_configure() -> None:
     """Put our parts in the place of theirs, before any test imports them."""
-    ours = importlib.import_module("torchrl_mpfa")
+    places = ("torchrl_mpfa", "torchrl_mpfa.samplers.prioritized")
+    ours = [importlib.import_module(place) for place in places]
     for name, replacement in KINDS[os.environ[_KIND]].items():
         for place in PLACES:
             module = importlib.import_module(place)
             if hasattr(module, name):
-                setattr(module, name, getattr(ours, replacement))
+                part = next(
+                    getattr(each, replacement) for each in ours if hasattr(each, replacement)
+                )
+                setattr(module, name, part)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
