@@ -17,7 +17,7 @@ import yaml
 import mpfa_envs
 import torchrl_mpfa
 import torchrl_mpfa.methods
-from mpfa_envs import World, deploy, export_policy, load_policy, planners, render, save_map
+from mpfa_envs import World, deploy, export_policy, load_policy, planners, render
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -150,7 +150,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     (tmp_path / "world_1.world").write_text(BOX)
-    save_map(World(name="office"), tmp_path / "office.yaml", resolution=0.1)
+    World(name="office").to_map(tmp_path / "office.yaml", resolution=0.1)
     return tmp_path
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs import Lidar, Task, World, load_world, save_map
+from mpfa_envs import Lidar, Task, World
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import shortest_length
 from mpfa_envs.paths.tasks import sample_task_on_grid
@@ -79,8 +79,8 @@ def main() -> None:
     grid = OccupancyGrid(building(), CELL)
     world = World(name="building", size=grid.size, occupancy=grid)
     with tempfile.TemporaryDirectory() as folder:
-        save_map(world, Path(folder) / "map.yaml")
-        reading = spent(lambda: load_world(Path(folder) / "map.yaml"), 3)
+        world.to_map(Path(folder) / "map.yaml")
+        reading = spent(lambda: World.from_map(Path(folder) / "map.yaml"), 3)
     start = time.process_time()
     grid.arrays  # noqa: B018
     print(f"reading {reading:.2f} s, arrays {time.process_time() - start:.2f} s")

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from mpfa_envs.tasks.sets import WorldTask as WorldTask
     from mpfa_envs.tasks.sets import world_tasks as world_tasks
     from mpfa_envs.worlds.builtin import WORLDS as WORLDS
-    from mpfa_envs.worlds.ros_map import save_map as save_map
     from mpfa_envs.worlds.shapes import Box as Box
     from mpfa_envs.worlds.shapes import Cylinder as Cylinder
     from mpfa_envs.worlds.shapes import Polygon as Polygon
@@ -84,7 +83,6 @@ _NAMES = {
     "tasks.reward": "RewardTerms StepOutcome navigation_reward",
     "tasks.sets": "WorldTask world_tasks",
     "worlds.builtin": "WORLDS",
-    "worlds.ros_map": "save_map",
     "worlds.shapes": "Box Cylinder Polygon",
     "worlds.task": "Task",
     "worlds.walker": "Walker",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mpfa_envs import load_world
+from mpfa_envs import World, load_world
 from tests.envs.map_files import write_map
 
 
@@ -25,7 +25,7 @@ def test_transparent_white_is_unknown(mode, kind, tmp_path):
     image.save(tmp_path / "map.png", **transparent)
     path = write_map(tmp_path, None, image="map.png", mode=mode)
     assert np.argwhere(load_world(path).occupancy.occupied).tolist() == [[1, 1]]
-    assert not load_world(path, unknown="free").occupancy.occupied.any()
+    assert not World.from_map(path, unknown="free").occupancy.occupied.any()
 
 
 def test_opacity_is_averaged_in_as_by_map_server_but_gray_of_map_saver_stays_unknown(tmp_path):

@@ -16,7 +16,6 @@ from mpfa_envs import (
     World,
     WorldFileError,
     load_world,
-    save_map,
     save_world,
 )
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -92,8 +91,8 @@ def test_robots_share_a_map_and_unused_maps_go(scattered):
 def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):
     grid = OccupancyGrid(cells(), 0.2, origin=(-3.5, 12.25))
     world = World(name="floor", size=grid.size, occupancy=grid)
-    save_map(world, tmp_path / "floor.yaml")
-    assert load_world(tmp_path / "floor.yaml") == world
+    world.to_map(tmp_path / "floor.yaml")
+    assert World.from_map(tmp_path / "floor.yaml") == world
     assert load_world(tmp_path / "floor.yaml") == world
     assert hash(load_world(tmp_path / "floor.yaml")) == hash(world)
     assert world_from_plain(world_to_plain(world)) == world
@@ -103,7 +102,7 @@ def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):
 @pytest.mark.parametrize("name", ["D", "barn-3", "halls-2"])
 def test_shapes_become_cells_that_cover_them_and_little_more(name, tmp_path):
     world = NavigationEnv(world=name, physics="kinematic").world
-    save_map(world, tmp_path / "map.yaml", resolution=0.1)
+    world.to_map(tmp_path / "map.yaml", resolution=0.1)
     found = load_world(tmp_path / "map.yaml")
     points = places(world, 500)[:, :2]
     gaps = found.clearances(points) - np.maximum(world.clearances(points), 0.0)
@@ -129,7 +128,7 @@ def test_a_map_is_cut_to_its_free_cells(tmp_path):
     world = load_world(write_map(tmp_path, shades))
     assert world.occupancy.occupied.shape == (27, 22)
     assert world.occupancy.origin == pytest.approx((-1.0 + 14 * 0.05, 2.0 + 29 * 0.05))
-    whole = load_world(write_map(tmp_path, shades), unknown="free")
+    whole = World.from_map(write_map(tmp_path, shades), unknown="free")
     assert whole.size == (2.5, 3.0)
     assert whole.occupancy.occupied.sum() == 20
 
@@ -150,7 +149,7 @@ def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_world(write_map(tmp_path, shades, free_thresh=0.196)) == world
-        assert load_world(saved, unknown="free").size == pytest.approx((8.0, 7.0))
+        assert World.from_map(saved, unknown="free").size == pytest.approx((8.0, 7.0))
 
 
 @pytest.mark.filterwarnings("ignore:.*free_thresh = 0.[279]")
@@ -246,7 +245,7 @@ def test_huge_broken_or_full_images_are_rejected(tmp_path):
     with pytest.raises(WorldFileError, match="must have a free cell"):
         load_world(path)
     with pytest.raises(ValueError, match="unknown must be one of"):
-        load_world(path, unknown="maybe")
+        World.from_map(path, unknown="maybe")
 
 
 def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_path):
@@ -257,12 +256,12 @@ def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_p
         OccupancyGrid(np.zeros((3, 3), dtype=bool), 0.0)
     with pytest.raises(ValueError, match="size must be that of the occupancy"):
         World(name="map", size=(3.0, 3.0), occupancy=world.occupancy)
-    with pytest.raises(ValueError, match="must be written by save_map"):
+    with pytest.raises(ValueError, match="must be written by to_map"):
         save_world(world, tmp_path / "world.yaml")
     with pytest.raises(ValueError, match="path must end in"):
-        save_map(world, tmp_path / "map.pgm")
+        world.to_map(tmp_path / "map.pgm")
     with pytest.raises(ValueError, match="resolution must leave"):
-        save_map(WORLDS["A"], tmp_path / "map.yaml", resolution=0.001)
+        WORLDS["A"].to_map(tmp_path / "map.yaml", resolution=0.001)
     assert not list(tmp_path.iterdir())
     plain = {**world.occupancy.plain, "cells": "AAAA"}
     with pytest.raises(ValueError, match="occupancy must hold"):

@@ -20,21 +20,17 @@ import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from mpfa_envs.checks import check_positive
 from mpfa_envs.files import read_file
 from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE
-from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError
-
-if TYPE_CHECKING:
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, read_nodes
 
 Mode = Literal["trinary", "scale", "raw"]
 """Meanings of shades between the thresholds."""
@@ -55,8 +51,6 @@ _WORDS: Final = {
 """Values of ``negate``."""
 _QUARTERS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Cosine and sine of the quarter turns."""
-_RESOLUTION: Final = 0.05
-"""Side of a cell in maps of worlds with shapes [m]."""
 _FREE: Final = 254
 """Shade of a free cell, as ROS's map_saver writes it."""
 _UNKNOWN: Final = 205
@@ -72,10 +66,13 @@ class _Rule(NamedTuple):
     free: float
 
 
-def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown) -> OccupancyGrid:
+def read_map(
+    path: Path, root: yaml.Node | None = None, *, unknown: Unknown = "occupied"
+) -> OccupancyGrid:
     """Read the cells of a map of ROS."""
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
+    root = read_nodes(path) if root is None else root
     reader = _Reader(path)
     entries = reader.mapping(root, "the file", _KEYS)
     for key in _KEYS[:-1]:
@@ -249,31 +246,11 @@ def _shades(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
     return mean, None if is_opaque else colors[..., 3]
 
 
-def save_map(
-    world: World, path: str | os.PathLike[str], *, resolution: float | None = None
-) -> None:
-    """Write the obstacles of a world as a map for ROS's map_server.
-
-    The cells of a map are written unchanged, and :func:`load_world` reads an equal world. A cell of
-    other worlds is occupied if its middle is within half a cell of an obstacle, and walls are one
-    cell thick. Walkers and regions are left out.
-
-    Args:
-        world: The world.
-        path: The YAML file; an image with the ending .pgm is written next to it.
-        resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
-
-    Raises:
-        ValueError: If the map would have too many cells, or the path does not end in .yaml.
-    """
+def write_map(grid: OccupancyGrid, path: str | os.PathLike[str]) -> None:
+    """Write cells as a map for ROS's map_server, the image next to the YAML file."""
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path must end in .yaml, got {str(path)!r}")
-    own = world.occupancy
-    if own is not None and not world.obstacles and resolution in (None, own.resolution):
-        grid = own
-    else:
-        grid = _rasterize(world, resolution or (own.resolution if own else _RESOLUTION))
     shades = np.where(grid.occupied.T[::-1], 0, _FREE).astype(np.uint8)
     content = {
         "image": path.with_suffix(".pgm").name,
@@ -287,19 +264,3 @@ def save_map(
     Image.fromarray(shades).save(path.with_suffix(".pgm"), format="PPM")
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
     path.write_text(text, encoding="utf-8")
-
-
-def _rasterize(world: World, resolution: float) -> OccupancyGrid:
-    """Cover a room and its walls with cells, and find the occupied ones."""
-    check_positive("resolution", resolution)
-    sides = [int(np.ceil(round(side / resolution, 6))) + 2 for side in world.size]
-    if sides[0] * sides[1] > MOST_CELLS or max(sides) > LONGEST_SIDE:
-        raise ValueError(
-            f"resolution must leave at most {MOST_CELLS} cells in {world.size} m, got {resolution}"
-        )
-    xs, ys = (resolution * (np.arange(count) - (count - 1) / 2) for count in sides)
-    points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-    near = world.clearances(points).reshape(sides[0], sides[1]) < resolution / 2 - 1e-9
-    center = world.occupancy.center if world.occupancy else (0.0, 0.0)
-    corner = tuple(at - side * resolution / 2 for at, side in zip(center, sides, strict=True))
-    return OccupancyGrid(near, resolution, (corner[0], corner[1]))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs.checks import all_finite
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.checks import all_finite, check_positive
+from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Point, Polygon, Shape
 from mpfa_envs.worlds.walker import MOST_WALKERS, Walker
 
@@ -21,6 +23,8 @@ __all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays
 
 MOST_OBSTACLES: Final = 1000
 """Greatest number of obstacles in a room."""
+_RESOLUTION: Final = 0.05
+"""Side of a cell of the map of a world that has none [m]."""
 _APART: Final = 0.05
 """Greatest distance between the points of a line whose clearance is measured [m]."""
 _PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
@@ -141,6 +145,72 @@ class World:
                         "walkers must keep their radius from obstacles and walls between their "
                         f"waypoints, which {walker} does not from {leg[0]} to {leg[1]}"
                     )
+
+    @staticmethod
+    def from_map(
+        path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
+    ) -> World:
+        """Read a map of ROS as a world, whose room is the known part of the map.
+
+        The room ends one cell beyond the outermost free cells.
+
+        Args:
+            path: The YAML file; the path of the image in it is relative to its folder.
+            unknown: Reading of unknown cells, ``"occupied"`` or ``"free"``.
+
+        Returns:
+            The world, with the name of the file. ``world.occupancy.center`` is the position of its
+            (0, 0) on the map.
+
+        Raises:
+            WorldFileError: If a file cannot be read or is no map; the message names the line.
+            ValueError: If unknown is neither.
+        """
+        # Imported here because it needs Pillow and PyYAML, and most worlds come from elsewhere.
+        from mpfa_envs.worlds.ros_map import read_map
+
+        path = Path(path)
+        grid = read_map(path, unknown=unknown)
+        return World(name=path.stem, size=grid.size, occupancy=grid)
+
+    def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
+        """Write the obstacles as a map for ROS's map_server.
+
+        The cells of a map are written unchanged, and :meth:`from_map` reads an equal world. A cell
+        of other worlds is occupied if its middle is within half a cell of an obstacle, and walls
+        are one cell thick. Walkers and regions are left out.
+
+        Args:
+            path: The YAML file; an image with the ending .pgm is written next to it.
+            resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
+
+        Raises:
+            ValueError: If the map would have too many cells, or the path does not end in .yaml.
+        """
+        from mpfa_envs.worlds.ros_map import write_map
+
+        own = self.occupancy
+        if own is not None and not self.obstacles and resolution in (None, own.resolution):
+            grid = own
+        else:
+            grid = self._cells(resolution or (own.resolution if own else _RESOLUTION))
+        write_map(grid, path)
+
+    def _cells(self, resolution: float) -> OccupancyGrid:
+        """Cover the room and its walls with cells, and find the occupied ones."""
+        check_positive("resolution", resolution)
+        sides = [int(np.ceil(round(side / resolution, 6))) + 2 for side in self.size]
+        if sides[0] * sides[1] > MOST_CELLS or max(sides) > LONGEST_SIDE:
+            raise ValueError(
+                f"resolution must leave at most {MOST_CELLS} cells in {self.size} m, got "
+                f"{resolution}"
+            )
+        xs, ys = (resolution * (np.arange(count) - (count - 1) / 2) for count in sides)
+        points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+        near = self.clearances(points).reshape(sides[0], sides[1]) < resolution / 2 - 1e-9
+        center = self.occupancy.center if self.occupancy else (0.0, 0.0)
+        corner = tuple(at - side * resolution / 2 for at, side in zip(center, sides, strict=True))
+        return OccupancyGrid(near, resolution, (corner[0], corner[1]))
 
     def __hash__(self) -> int:
         """Hash once: worlds are keys of caches and may have hundreds of obstacles."""

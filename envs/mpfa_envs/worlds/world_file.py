@@ -14,7 +14,7 @@ import yaml
 
 from mpfa_envs.files import check_replaceable, write_atomically
 from mpfa_envs.worlds.plain import walker_to_plain
-from mpfa_envs.worlds.ros_map import Unknown, read_map
+from mpfa_envs.worlds.ros_map import read_map
 from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
 from mpfa_envs.worlds.walker import Walker
 from mpfa_envs.worlds.world import World
@@ -37,24 +37,20 @@ _MOST_CELLS: Final = 100_000
 """A region that leaves more squares undecided is too large and too narrow to search."""
 
 
-def load_world(path: str | os.PathLike[str], *, unknown: Unknown = "occupied") -> World:
+def load_world(path: str | os.PathLike[str]) -> World:
     """Read a world from a YAML file; ``docs/worlds.md`` describes the format.
 
-    A YAML file with the key ``image`` is a map of ROS, see ``docs/maps.md``. The room ends one cell
-    beyond the outermost free cells of the map.
+    A YAML file with the key ``image`` is a map of ROS and read as by :meth:`World.from_map`.
 
     Args:
-        path: The file; the path of an image in it is relative to its folder.
-        unknown: Reading of unknown cells of a map, ``"occupied"`` or ``"free"``.
+        path: The file.
 
     Returns:
-        The world; without a name in the file, it has that of the file. ``world.occupancy.center``
-        is the position of its (0, 0) on a map.
+        The world; without a name in the file, it has that of the file.
 
     Raises:
         WorldFileError: If the file cannot be read, is too large, is not YAML, or does not describe
             a world.
-        ValueError: If unknown is neither.
 
     Examples:
         >>> from mpfa_envs import EXAMPLE_WORLD, load_world
@@ -65,7 +61,7 @@ def load_world(path: str | os.PathLike[str], *, unknown: Unknown = "occupied") -
     path = Path(path)
     root = read_nodes(path)
     if is_map(root):
-        grid = read_map(path, root, unknown=unknown)
+        grid = read_map(path, root)
         return World(name=path.stem, size=grid.size, occupancy=grid)
     return _Reader(path).world(root)
 
@@ -194,7 +190,7 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
 
     Raises:
         FileExistsError: If there is a file that is no world, and overwrite is false.
-        ValueError: If the world has the cells of a map, which ``save_map`` writes, or
+        ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes, or
             :func:`load_world` would reject the file, as it does one without a name; nothing is
             written then.
 
@@ -209,7 +205,7 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     """
     if world.occupancy is not None:
         raise ValueError(
-            f"world {world.name!r} must be written by save_map, as it has the cells of a map"
+            f"world {world.name!r} must be written by to_map, as it has the cells of a map"
         )
     content: dict[str, object] = {
         "name": world.name,
