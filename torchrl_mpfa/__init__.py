@@ -15,9 +15,12 @@ if TYPE_CHECKING:
     from torchrl_mpfa.fusion import ScaledFusion as ScaledFusion
     from torchrl_mpfa.history import ReplayHistory as ReplayHistory
     from torchrl_mpfa.learners import ActorCriticLearner as ActorCriticLearner
+    from torchrl_mpfa.learners import DDPGLearner as DDPGLearner
     from torchrl_mpfa.learners import DQNLearner as DQNLearner
     from torchrl_mpfa.learners import Learner as Learner
+    from torchrl_mpfa.learners import SACLearner as SACLearner
     from torchrl_mpfa.learners import TabularQLearner as TabularQLearner
+    from torchrl_mpfa.learners import TD3Learner as TD3Learner
     from torchrl_mpfa.losses import SignalDDPGLoss as SignalDDPGLoss
     from torchrl_mpfa.losses import SignalDQNLoss as SignalDQNLoss
     from torchrl_mpfa.losses import SignalSACLoss as SignalSACLoss
@@ -48,7 +51,9 @@ _NAMES = {
     "buffer": "SignalReplayBuffer",
     "fusion": "EntropyFusion FixedFusion Fusion ScaledFusion",
     "history": "ReplayHistory",
-    "learners": "ActorCriticLearner DQNLearner Learner TabularQLearner",
+    "learners": (
+        "ActorCriticLearner DDPGLearner DQNLearner Learner SACLearner TD3Learner TabularQLearner"
+    ),
     "losses": (
         "SignalDDPGLoss SignalDQNLoss SignalSACLoss SignalTD3Loss make_ddpg_loss make_sac_loss "
         "make_td3_loss"

@@ -302,6 +302,10 @@ class ActorCriticLearner(OptimizedLearner):
         self.loss.keep_target_critics()
 
 
+DDPGLearner = TD3Learner = SACLearner = ActorCriticLearner
+"""The learner by the algorithm of its loss, for scripts that read better with that name."""
+
+
 def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
     """Make the optimizer of this name, which steps all tensors in one call."""
     if name == "adam":
