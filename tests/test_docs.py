@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import unicodedata
 from collections.abc import Iterator
@@ -102,6 +103,17 @@ def test_every_public_name_is_in_the_reference_once(package: str, names: list[st
     }
     kit = set(render.__all__)
     assert {name for name in names if counts[name] != 1 and name not in kit} == set()
+
+
+def test_every_name_of_the_reference_can_be_resolved() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md"))
+    missing = []
+    for name in re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE):
+        try:
+            pkgutil.resolve_name(name)
+        except (AttributeError, ImportError):
+            missing.append(name)
+    assert missing == []
 
 
 SMALL = {
