@@ -17,7 +17,7 @@ from typing import Any
 
 import pandas as pd
 
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.report import table
 from training.finished import read_json

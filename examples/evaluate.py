@@ -47,7 +47,7 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.safety.filter import CLEARANCE
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.environments import check_physics
 from training.evaluating import (

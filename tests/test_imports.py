@@ -35,7 +35,7 @@ def documented(package, alias):
 @pytest.mark.parametrize(
     ("package", "names"),
     [
-        ("torchrl_mpfa", ["files.save_atomically", "methods.her.HindsightGoals"]),
+        ("torchrl_mpfa", ["saving.save_atomically", "methods.her.HindsightGoals"]),
         ("mpfa_envs", ["worlds.barn.barn_world", "deploy.map_path", "generators.resolve"]),
     ],
 )

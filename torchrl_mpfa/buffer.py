@@ -16,9 +16,9 @@ from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_generator
-from torchrl_mpfa.files import check_saved, load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
+from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.transforms import KEPT

@@ -20,7 +20,7 @@ from benchmarks.paper.tables import (
     trained_table,
     unseen_table,
 )
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 
 COMMIT = "a0a3ab5"
 """Commit that trained and tested every run of the kept rows."""

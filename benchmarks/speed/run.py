@@ -32,7 +32,7 @@ from benchmarks.speed import (
     worlds,
 )
 from benchmarks.speed.timing import Entry
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 
 LATEST = Path(__file__).with_name("latest.json")
 

@@ -16,7 +16,7 @@ from benchmarks.values.frozen import FrozenBuffer
 from benchmarks.values.learning import compared
 from benchmarks.values.statistics import RANKS, differences, paired
 from mpfa_envs.render.charts import finish, look, new_figure
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training.comparison.report import table
 from training.statistics import holm, mean_interval
 

@@ -20,8 +20,8 @@ from benchmarks.values.arms import AGAINST, ARMS
 from benchmarks.values.frozen import FrozenBuffer, frozen_buffers
 from benchmarks.values.learning import Measure, ReplayFunction, SignalFunction, learn
 from benchmarks.values.statistics import differences
-from torchrl_mpfa.files import write_text_atomically
 from torchrl_mpfa.methods import Method
+from torchrl_mpfa.saving import write_text_atomically
 
 _RUN = ["buffer", "method", "seed"]
 _DIGITS = 5

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 
 # Imported where a table is made: it takes half a second, which a run's start need not wait.
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from tests.mpfa.losses import (
     without_shortcut,
 )
 from torchrl_mpfa import ActorCriticLearner, SignalDDPGLoss, make_ddpg_loss
-from torchrl_mpfa.files import load_safely, save_atomically
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 

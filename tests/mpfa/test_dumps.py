@@ -27,7 +27,7 @@ from tests.mpfa.transitions import (
     train_rounds,
 )
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.files import (
+from torchrl_mpfa.saving import (
     MANIFEST,
     new_dump,
     open_dump,

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer, rejected, same, snapshot, write_signals
 from torchrl_mpfa import SignalMemmapStorage, SignalTensorStorage
-from torchrl_mpfa.files import load_safely, save_atomically
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 CAPACITY = 7
 

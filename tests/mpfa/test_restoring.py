@@ -23,7 +23,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.files import load_safely, save_atomically, seal_dump
+from torchrl_mpfa.saving import load_safely, save_atomically, seal_dump
 
 CAPACITY = 24
 UNALLOCATED = pytest.mark.filterwarnings(

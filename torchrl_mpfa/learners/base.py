@@ -19,9 +19,9 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.files import check_saved_numbers
 from torchrl_mpfa.learners.compiled import CompiledGradients
 from torchrl_mpfa.losses import SignalLoss
+from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, Trains
 
 OptimizerName = Literal["adam", "radam"]

@@ -22,10 +22,10 @@ from torchrl_mpfa.adjustment import (
     one_sided,
 )
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite, unknown
-from torchrl_mpfa.files import check_saved
 from torchrl_mpfa.fusion import Annealed, FixedFusion, Fusion, checked_weights, fuse
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.trees import as_slots, in_dimensions_of, last_of_each
+from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.storages.table import Columns, SignalTable, by_batch, signal_table_of
 

@@ -12,9 +12,9 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import check_counts, check_index, unknown
 from torchrl_mpfa.episodes import follows
-from torchrl_mpfa.files import check_saved
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.trees import as_slots, leaves_of, set_leaves
+from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
-from torchrl_mpfa.files import check_saved, load_safely, save_atomically
 from torchrl_mpfa.samplers.trees import leaves_of, set_leaves
+from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
 
 FORMAT = 3
 """Version of saved states."""

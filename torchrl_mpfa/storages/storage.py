@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.checks import as_mask, generator_on
-from torchrl_mpfa.files import check_saved, load_safely, open_dump, save_atomically, seal_dump
+from torchrl_mpfa.saving import check_saved, load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
 from torchrl_mpfa.storages.table import SignalTable
 

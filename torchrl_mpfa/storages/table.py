@@ -23,7 +23,7 @@ from torchrl_mpfa.checks import (
     check_finite,
     check_index,
 )
-from torchrl_mpfa.files import check_saved
+from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
 Priority = Callable[[Tensor], Tensor] | None

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.arms import PLAIN, Arm, with_defaults
 from training.evaluating import evaluation_folder

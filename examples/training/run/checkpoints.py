@@ -12,7 +12,7 @@ import torch
 
 from mpfa_envs import save_policy
 from torchrl_mpfa import Learner
-from torchrl_mpfa.files import load_safely, save_atomically
+from torchrl_mpfa.saving import load_safely, save_atomically
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord, as_table, write_table
 from training.run.evaluations import kept_policy

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
 

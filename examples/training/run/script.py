@@ -19,7 +19,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
 from torch._dynamo.exc import BackendCompilerFailed
 
-from torchrl_mpfa.files import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.finished import after_the_end, is_finished
 from training.records import EpisodeRecord, as_table

@@ -26,8 +26,8 @@ from tests.integration.tiny_runs import (
     train,
 )
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.files import save_atomically
 from torchrl_mpfa.methods import ALIASES, METHODS
+from torchrl_mpfa.saving import save_atomically
 from training.files import CHECKPOINT
 from training.records import EvaluationRecord
 from training.run import checkpoints, loop

@@ -14,7 +14,7 @@ from tests.mpfa.transitions import (
     Trap,
     same,
 )
-from torchrl_mpfa.files import (
+from torchrl_mpfa.saving import (
     check_saved_numbers,
     load_safely,
     save_atomically,
