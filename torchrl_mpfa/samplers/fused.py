@@ -238,11 +238,12 @@ class SignalSampler(TreeSampler):
         stale = 0 if live is None else len(live) - len(slots)
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
         table.fill_learned(rows, signals, self._learned, live, sizes)
+        parts = by_batch(sizes, slots, rows)
         table.check_fused(rows, self._names, self._columns)
         if slots.numel() == 0:
             return stale
         weighing, adjusted = self._weighing, []
-        for one, of_one in by_batch(sizes, slots, rows):
+        for one, of_one in parts:
             if len(one):
                 weighing = self._weigh(table, one, weighing)  # Eqs. (15)-(20).
                 adjusted.append(self._fused(table, of_one, one, weighing))  # Eqs. (21)-(24).
@@ -286,10 +287,13 @@ class SignalSampler(TreeSampler):
         fresh = table.writes - (0 if last is None else last.writes)
         due = always or not 0 <= fresh <= self.entropy_refresh * table.size
         if last is None or due:
-            weights = checked_weights(self.fusion, self._names, table, index)
-            if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
+            weights, rewards = (
+                checked_weights(self.fusion, self._names, table, index),
+                table.rewards,
+            )
+            if (text := one_sided(rewards, (self.fusion, *self.adjustments))) is not None:
                 self._warn_once(text)
-            mean, before = float(table.rewards.mean()), last or Weighing()
+            mean, before = float(rewards.mean()), last or Weighing()
             made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
         elif getattr(self.fusion, "every_batch", False):
             made = replace(last, weights=checked_weights(self.fusion, self._names, table, index))

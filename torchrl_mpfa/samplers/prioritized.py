@@ -426,9 +426,9 @@ class TreeSampler(SavedTrees):
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""
         self._priorities.index_copy_(0, slots, priority)
+        self._write_leaves(slots, self._leaf(priority))
         given = -priority if learned else torch.full_like(priority, math.inf)
         set_leaves(slots, given, self._max_tree)
-        self._write_leaves(slots, self._leaf(priority))
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         """Write leaves, to which slots are sampled in proportion, shape ``[B]``."""
