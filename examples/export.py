@@ -40,7 +40,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "path", type=Path, help=f"policy.npz, the folder of a run, or {', '.join(POLICIES)}"
     )
-    parser.add_argument("--output", type=Path, help="the file (default: NAME.onnx beside it)")
+    parser.add_argument("--output", type=Path, help="the file (default: NAME.onnx next to it)")
     parser.add_argument("--quantize", action="store_true", help="round weights to eight bits")
     parser.add_argument("--world", default="test", help="where both drive (default: test)")
     parser.add_argument(
@@ -102,7 +102,7 @@ def driven(policy: Policy, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> Path:
-    """Export, compare, tell.
+    """Export, compare and report.
 
     Args:
         arguments: The command line.
@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     options = parse(arguments)
     policy: Policy = options.policy
     results = known_results(options.source)
-    # Beside its place at first: a file that differs from its policy must not lie there.
+    # Next to its place at first: a file that differs from its policy must not lie there.
     trial = options.output.with_name(f".{os.getpid()}.{options.output.name}")
     try:
         export_policy(policy, trial, quantize=options.quantize)

@@ -46,7 +46,7 @@ EPISODES = 200
 
 
 class Memory(nn.Module):
-    """What is seen, and what a GRU remembers of all that was seen before."""
+    """Join the observation with a GRU's memory of those before."""
 
     def __init__(self, size: int, *, forgetful: bool) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""How signals, priorities and importance weights of a buffer change while it is trained from."""
+"""Record signals, priorities and importance weights of a buffer during training."""
 
 from __future__ import annotations
 

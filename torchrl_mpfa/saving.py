@@ -30,7 +30,7 @@ _LOCK = ".lock"
 _ENDINGS = {".json", ".memmap", ".pt"}
 """Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
 _EVALUATED = "data_indices.json"
-"""Where this is, TorchRL's compressed storage executes text of its ``metadata.json``."""
+"""File by whose presence TorchRL's storage executes text of its ``metadata.json``."""
 _NO_COMMENT = bytes(2)
 """The last bytes of an archive without a comment: the length of that comment."""
 _MARK = b"crc32:"

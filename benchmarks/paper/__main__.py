@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _write(rows: Path, output: Path | None) -> int:
-    """Write the page; the figures of the kept rows lie beside these."""
+    """Write the page; the figures of the kept rows lie next to these."""
     page = (output or Path("docs")) / "paper.md"
     for path in write_page(read_rows(rows), page, output or FOLDER):
         print(f"written: {path}")

@@ -1,4 +1,4 @@
-"""The paper's Tables 2 to 4 with our numbers beside the paper's, and the comparisons of methods."""
+"""The paper's Tables 2 to 4 with our numbers next to theirs, and the comparisons of methods."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ OTHER_ARMS = {
         for robots, end in (("one robot", f"-{ONE_ROBOT.name}"), ("sixteen robots", ""))
     },
 }
-"""Arms beside the thirteen methods, by their names in the tables."""
+"""Arms in addition to the thirteen methods, by their names in the tables."""
 
 
 @dataclass(frozen=True)

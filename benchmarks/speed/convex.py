@@ -17,7 +17,7 @@ def convex_parts(polygon: Polygon) -> list[Polygon]:
 
 
 def _is_ear(vertices: list[Point], at: int) -> bool:
-    """Tell whether a vertex can be cut off, with the line between its neighbors all inside."""
+    """Return True if a vertex can be cut off, with the line between its neighbors all inside."""
     a, b, c = vertices[at - 1], vertices[at], vertices[(at + 1) % len(vertices)]
     if _turn(a, b, c) <= 0.0:
         return False

@@ -1,4 +1,4 @@
-"""What a large map costs: reading it, a scan, a clearance, a task; and boxes in its place.
+"""Measure the cost of a large map: reading, a scan, a clearance, a task; and of boxes instead.
 
     python -m benchmarks.speed.maps
 

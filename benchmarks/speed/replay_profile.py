@@ -1,4 +1,4 @@
-"""Where the time of sampling and of new priorities goes, as a Markdown table.
+"""Profile the time of sampling and of new priorities, as a Markdown table.
 
     python -m benchmarks.speed.replay_profile       256 and 16 x 256 of 100,000 transitions
     python -m benchmarks.speed.replay_profile --capacity 1000000

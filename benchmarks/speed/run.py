@@ -91,7 +91,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
 
 
 def format_table(entries: Sequence[Entry]) -> str:
-    """One line an entry, with the target beside the ratios that have one."""
+    """One line an entry, with the target next to the ratios that have one."""
     width = max((len(entry["name"]) for entry in entries), default=4) + 2
     lines = [f"{'name':{width}}{'value':>12} {'unit':9}{'ratio':>8}{'target':>8}  baseline"]
     for entry in entries:

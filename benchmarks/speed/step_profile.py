@@ -1,4 +1,4 @@
-"""Where the time of a training step goes, as a Markdown table.
+"""Profile the time of a training step, as a Markdown table.
 
     python -m benchmarks.speed.step_profile       2 x 64 and 2 x 256 units, eager and compiled
     python -m benchmarks.speed.step_profile --widths 128

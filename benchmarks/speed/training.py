@@ -310,7 +310,7 @@ def measure_sb3_step(*, quick: bool) -> list[Entry]:
 
 
 def _variants(name: str, make: Callable[..., Call], *, quick: bool) -> dict[str, Call]:
-    """The way ``make train`` has it, compiled if there is a C++ compiler, and beside it eager."""
+    """Time an update as ``make train`` has it, compiled if there is a C++ compiler, and eager."""
     if quick:
         return {name: make()}
     if not has_compiler():

@@ -1,4 +1,4 @@
-"""What a new world costs, and what the worlds look like.
+"""Measure the cost of a new world, and picture the worlds.
 
 python -m benchmarks.speed.worlds                         # a table of the generators
 python -m benchmarks.speed.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
@@ -24,7 +24,7 @@ from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.worlds.barn import barn_world
 
 DISTANCE = 0.25
-"""What ways keep from obstacles: a TurtleBot2's radius and 0.07 m [m]."""
+"""Distance of paths from obstacles: a TurtleBot2's radius and 0.07 m [m]."""
 WORLDS = 60
 """Worlds of a generator that are measured in turn."""
 _MILLISECONDS = 1e3

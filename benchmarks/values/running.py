@@ -35,7 +35,7 @@ def compare(
     signals: Mapping[str, SignalFunction] | None = None,
     against: str = AGAINST,
 ) -> pd.DataFrame:
-    """Train each method on each buffer with each seed, and tell their differences to one of them.
+    """Train each method on each buffer with each seed, and report their differences to one of them.
 
     Args:
         methods: As for :func:`~benchmarks.values.learn`.
@@ -132,7 +132,7 @@ def _buffers(folder: Path) -> list[FrozenBuffer]:
 
 
 def _quiet() -> None:
-    """Have TorchRL not tell of each storage that it makes."""
+    """Silence TorchRL's message about each new storage."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 

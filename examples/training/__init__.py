@@ -2,5 +2,5 @@
 
 It puts the parts of :mod:`torchrl_mpfa` and the task of :mod:`mpfa_envs` together. What a pipeline
 of your own would need is in those two packages. ``settings`` knows no other folder; ``run`` and
-``comparison``, which starts the scripts as processes, import it. What they share lies beside them.
+``comparison``, which starts the scripts as processes, import it. Shared modules lie here.
 """

@@ -25,7 +25,7 @@ class MWSampler(SignalSampler):
     """Excludes a transition that was replayed often enough.
 
     Where fewer transitions are left than a batch has, a batch is sampled uniformly from all, so
-    that the training goes on. Mind the number: with one update of 256 transitions a step, each is
+    that the training continues. Mind the number: with one update of 256 transitions a step, each is
     replayed 256 times on average, and a cap below would leave little but the newest.
 
     Args:

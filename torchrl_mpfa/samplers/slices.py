@@ -22,7 +22,7 @@ SlicePriority = Literal["mean", "start"]
 """Priority of a slice: the mean over its steps, or that of its first step."""
 _TRAJ_IDS = ("collector", "traj_ids")
 _SETTINGS = ("slice_len", "slice_priority", "strict_length")
-"""What a saved sampler must have been made with."""
+"""Arguments that a saved sampler must have been made with."""
 _AT_ONCE = 65_536
 """Slices that are looked at in one pass, which bounds the memory that this takes."""
 

@@ -371,7 +371,7 @@ class Pilot:
 
 
 def _widening(robot: RobotModel, learned: RobotModel) -> float:
-    """How much more its wheels differ on the same arc than those of another robot, at least 1."""
+    """Ratio of wheel speed differences to another robot's on the same arc, at least 1."""
     return max(1.0, robot.wheel_base / learned.wheel_base)
 
 

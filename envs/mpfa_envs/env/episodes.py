@@ -97,7 +97,7 @@ class EpisodeSource:
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
         self.begins: dict[int, Beginning] = {}
-        """What each robot's episode was sampled from."""
+        """Source of each robot's episode: its random state, and a given world and task."""
         # A world without any task fails here, before anything runs.
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]

@@ -266,7 +266,7 @@ class RobotBatch:
         )
 
     def moments(self) -> NDArray[np.float64]:
-        """What a goal in hindsight needs of the present, ``[N, 9 + rays]``.
+        """Return the state that hindsight relabeling needs, ``[N, 9 + rays]``.
 
         Position (x, y), the room's size, pose and speeds by odometry, and the range of each ray [m,
         m/s, rad], of which a ray that met a walker has the greatest, as in the robot's map.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Beginning(NamedTuple):
-    """What an episode was sampled from."""
+    """Source of an episode: its random state, and a given world and task."""
 
     generator: Mapping[str, Any]
     """State of the robot's random generator."""

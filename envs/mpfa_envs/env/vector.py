@@ -174,7 +174,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
     @property
     def moments(self) -> NDArray[np.float64]:
-        """What a goal in hindsight needs of the present, ``[N, 9 + rays]`` [m, m/s, rad]."""
+        """State that hindsight relabeling needs, ``[N, 9 + rays]`` [m, m/s, rad]."""
         return self._batch.moments()
 
     @property

@@ -66,7 +66,7 @@ def fields(rng: random.Random, difficulty: float) -> World:
 def _grow(
     rng: random.Random, shape: tuple[int, int], fill: float, rounds: int
 ) -> NDArray[np.bool_]:
-    """Fill cells at random and let the automaton smooth them; the walls beside count as full."""
+    """Fill cells at random and let the automaton smooth them; walls count as full."""
     count = shape[0] * shape[1]
     noise = np.frombuffer(rng.randbytes(count), dtype=np.uint8).reshape(shape)
     filled = noise < round(256 * fill)

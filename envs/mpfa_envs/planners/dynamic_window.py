@@ -20,7 +20,7 @@ _STEP: Final = 0.1
 _RESOLUTION: Final = 0.05
 """Difference between the speeds of a wheel that are tried [m/s]."""
 _ACCELERATION: Final = 1.0
-"""That of wheels that change their speed at once [m/s²]."""
+"""Acceleration of wheels that change their speed at once [m/s²]."""
 _LENGTH: Final = 0.6
 """Least length of the arcs [m]."""
 _OPEN: Final = 0.3
@@ -258,7 +258,7 @@ class DynamicWindow:
     def _facing(
         self, target: NDArray[np.float64], window: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """How far each arc ends facing its target, from 0 to 1, ``[K]``."""
+        """Score how well each arc ends facing its target, from 0 to 1, ``[K]``."""
         x, y = (target - self.arcs[window, -1]).T
         return 1.0 - _angles_between(np.arctan2(y, x), self._turned[window]) / math.pi
 

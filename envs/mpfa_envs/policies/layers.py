@@ -239,7 +239,7 @@ def _scale(module: Any, before: Sequence[Layer]) -> Scale:
 
 
 def _array(tensor: Any) -> NDArray[np.float32]:
-    # A copy: training goes on in the tensor.
+    # A copy: training continues in the tensor.
     return np.array(tensor.detach().cpu().numpy(), dtype=np.float32)
 
 

@@ -42,7 +42,7 @@ def film_episode(
     """Drive one episode and picture it.
 
     The robot, its lidar and its trail are seen from above, as
-    :meth:`~mpfa_envs.NavigationEnv.render` gives them. Beside them are the speeds of its wheels in
+    :meth:`~mpfa_envs.NavigationEnv.render` gives them. Next to them are the speeds of its wheels in
     the last ten seconds and, if it is known, the value of what the robot sensed so far.
 
     Args:

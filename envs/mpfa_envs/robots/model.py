@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 TRAINING_CLEARANCE: Final = 0.07
 """Clearance of the robot's rim below which training counts a collision [m]."""
 PAPER_CLEARANCE: Final = 0.17
-"""That of the paper, 0.35 m from the center of a TurtleBot2 [m]."""
+"""Margin of the paper, 0.35 m from the center of a TurtleBot2 [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class RobotModel:
 
     @property
     def wheel_limits(self) -> WheelLimits:
-        """What its wheels can do, as compiled loops read it."""
+        """Limits of the wheels, as compiled loops read them."""
         change = math.inf if self.wheel_acceleration is None else self.wheel_acceleration
         across = math.inf if self.turn_limit is None else 0.5 * self.turn_limit * self.wheel_base
         return WheelLimits(self.min_wheel_speed, self.max_wheel_speed, across, change)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class WheelLimits(NamedTuple):
-    """What the wheels of a robot can do."""
+    """Speeds and acceleration that the wheels of a robot can have."""
 
     slow: float
     """Slowest speed of a wheel [m/s]."""
@@ -22,7 +22,7 @@ class WheelLimits(NamedTuple):
     across: float
     """Greatest difference of a wheel's speed from the mean of both [m/s]."""
     acceleration: float
-    """How fast the speed of a wheel changes [m/s²]."""
+    """Acceleration of a wheel [m/s²]."""
 
 
 _ROUNDING = 1e-12

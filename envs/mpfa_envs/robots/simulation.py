@@ -94,7 +94,7 @@ class Simulation:
             for other in self._wheels:
                 for link in links.values():
                     server.setCollisionFilterGroupMask(self.bodies[other], link, _ROBOTS, ~_ROBOTS)
-        # Friction in a call of its own: beside damping the engine gives that of a link to the base
+        # Friction has a separate call: with damping the engine gives that of a link to the base
         # (https://github.com/bulletphysics/bullet3/issues/3314).
         server.changeDynamics(
             body,

@@ -151,7 +151,7 @@ class Track:
             self._past.append(felt)
             return ""
         before = self._past[-1]
-        # Headings go on beyond half a turn, so that turns can be compared.
+        # Headings continue beyond half a turn, so that turns can be compared.
         x, y, heading = felt.pose
         heading += math.tau * round((before.pose[2] - heading) / math.tau)
         felt = felt._replace(pose=(x, y, heading))

@@ -157,7 +157,7 @@ class SafetyFilter:
         """Ranges of all rays [m], ``[N, R]``: each may be the one that its sector reports."""
         closeness = rows[:, self._parts["lidar"]]
         ranges = self._near / np.maximum(closeness, 1e-9)
-        # What is nearer than the observation tells may be at the rim.
+        # An obstacle nearer than the observation can show may be at the rim.
         ranges[closeness >= 1.0] = min(self._near, self.robot.radius)
         ranges[ranges >= 0.999 * self._max_range] = math.inf
         # What is not seen begins at the rim, which may leave it but not approach it.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Body(NamedTuple):
-    """What the filter knows of a robot and its time."""
+    """Sizes, limits and time steps of a robot, as the filter reads them."""
 
     limits: WheelLimits
     wheel_base: float
@@ -71,7 +71,7 @@ def filter_actions(
             gaps[k] = (across + along) ** 2 + _TURNS * (across - along) ** 2
         chosen[robot] = candidates[last]
         if body.limits.slow > 0.0:
-            # Sectors tell less than the truth: the circle that was free before may seem to be
+            # Sectors show less than the truth: the circle that was free before may seem to be
             # blocked now, and the freer one is the better guess.
             around = _turning_radius(body.limits, body.wheel_base)
             to_left = _nearest(0.0, around, points[:count])

@@ -20,7 +20,7 @@ BLOCKED: Final = 3
 """A cell where the robot's center cannot be."""
 FACTORS: Final = np.array((1, 3, 30, 200), dtype=np.int64)
 """Cost of a step in a free cell, one near an obstacle, a tight and a blocked one. None is infinite:
-a robot may stand where it should not, and where all paths are blocked it goes on looking. But a
+a robot may stand where it should not, and where all paths are blocked it continues to look. But a
 wall, some five blocked cells thick, must cost more than any path around it."""
 STRAIGHT: Final = 10
 """Length of a straight step."""

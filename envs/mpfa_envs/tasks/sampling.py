@@ -166,7 +166,7 @@ def _can_be_won(
     goal_radius: float,
 ) -> bool:
     """Return True if a path that keeps the distance leads to the goal, or within its radius."""
-    # A goal may lie nearer to a wall than a robot comes, and is reached from beside it then.
+    # A goal may lie nearer to a wall than a robot comes, and is reached from its side then.
     around = [
         (goal[0] + share * goal_radius * across, goal[1] + share * goal_radius * up)
         for share in (0.5, 0.99)

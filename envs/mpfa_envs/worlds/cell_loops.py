@@ -2,7 +2,7 @@
 
 A ray steps from one square without an occupied cell to the next, as large as the cells around
 allow (Amanatides and Woo 1987 with the jumps of Cohen and Sheffer 1994): in a hall it takes few
-steps, and beside a wall one for each cell. Where it enters an occupied cell is exact, as for a box.
+steps, and along a wall one for each cell. Where it enters an occupied cell is exact, as for a box.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class _Reader:
             self.left_out["other collisions"] += others
 
     def summary(self) -> str:
-        """What is read and what is left out."""
+        """Elements that are read and elements that are left out."""
         parts = ", ".join(f"{count} {what}" for what, count in self.left_out.items())
         return f"read {self._read} of {self._total} collisions, left out {parts or 'nothing'}"
 

@@ -8,7 +8,7 @@ are p in percent, and above that unknown. With ``trinary`` the shade is the mean
 opacity included, as in the map_servers of ROS 1 and Nav2: transparent white is unknown.
 
 With ``trinary`` and without ``negate`` the shade 205 is always unknown: ROS's own map_saver writes
-it for unknown cells beside a ``free_thresh`` of 0.25, under which it would be free.
+it for unknown cells with a ``free_thresh`` of 0.25, under which it would be free.
 """
 
 from __future__ import annotations
@@ -207,7 +207,9 @@ class _Reader(NodeReader):
             raise
         except FileNotFoundError:
             beside = self.path.parent / re.split(r"[\\/]", name)[-1]
-            hint = f"; write image: {beside.name}, which lies beside it" if beside.is_file() else ""
+            hint = (
+                f"; write image: {beside.name}, which lies next to it" if beside.is_file() else ""
+            )
             text = f"image must be a file, and there is no {path}{hint}"
             raise self.error(node, text) from None
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

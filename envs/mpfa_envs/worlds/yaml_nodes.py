@@ -18,7 +18,7 @@ _LARGEST_FILE: Final = 1_000_000
 _MOST_ENTRIES: Final = 1000
 """Longest list: with aliases, a line of ten letters can stand for a hundred corners."""
 _IMAGE: Final = re.compile(r"""^[\ufeff \t{]*["']?image["']?[ \t]*:""", re.MULTILINE)
-"""What only the YAML file of a map has, which other tools write."""
+"""Key that only the YAML file of a map has, which other tools write."""
 
 
 KINDS: Final = (

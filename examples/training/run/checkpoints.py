@@ -1,4 +1,4 @@
-"""What a run saves: its checkpoint, its policy and its records."""
+"""Files that a run saves: its checkpoint, its policy and its records."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def has_compiler() -> bool:
 
 def prepare_compiler() -> None:
     """Set PyTorch's compiler for a few small programs on a CPU."""
-    # Threads wait for the C++ compiler. Processes beside them, to compile programs of a GPU, would
+    # Threads wait for the C++ compiler. Further processes, to compile programs of a GPU, would
     # be started for nothing.
     os.environ.setdefault("TORCH_WARM_POOL", "0")
     # It need not compile a program for each set of vector instructions that the processor has, a

@@ -1,6 +1,6 @@
 """Checks of settings: parts are built, and their errors get the name of the setting.
 
-Beyond that there are the rules beside the settings, and what settings may not be together. Each
+Rules stand next to the settings; combinations that are not allowed stand here. Each
 error is one sentence, raised before anything has started.
 """
 
@@ -141,7 +141,7 @@ def _check_ray(settings: TrainSettings) -> None:
 
 
 def _check_discrete(settings: TrainSettings) -> None:
-    """Raise if a setting needs continuous actions, or an actor beside the critic."""
+    """Raise if a setting needs continuous actions, or an actor in addition to the critic."""
     method, algorithm = settings.method, settings.learner.algorithm
     if settings.learner.compile is True:
         raise ValueError(f"learner.compile must be false with {algorithm}, got True")

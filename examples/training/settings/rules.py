@@ -1,4 +1,4 @@
-"""Rules of settings beside their defaults, and the names of settings in errors."""
+"""Rules of settings next to their defaults, and the names of settings in errors."""
 
 from __future__ import annotations
 
