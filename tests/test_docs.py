@@ -236,3 +236,134 @@ def test_the_pilot_on_the_page_on_robots_decides_by_scans(folder: Path) -> None:
 def test_no_page_has_code_that_is_not_run() -> None:
     have = {page for page in PAGES if "```python\n" in (DOCS / page).read_text(encoding="utf-8")}
     assert have - {*HOWTO, *TASK_PAGES, *ELSEWHERE} == {"tutorial.md", "robot.md"}
+
+
+CODE = re.compile(r"^(```+).*?^\1|<!--.*?-->", re.DOTALL | re.MULTILINE)
+NO_PROSE = re.compile(r"\s*(?:\||!\[|<|[-|=+:]{4,}$)|#+ ")
+"""A line of a table, a picture, a tag of HTML, a rule or a title."""
+SHOWN = (
+    (re.compile(r"\$[^$]*\$|`[^`]*`"), "CODE"),
+    (re.compile(r"\[([^\]]*)\]\([^)]*\)"), r"\1"),
+    (re.compile(r"<[^>]+>|[*_]{1,3}"), ""),
+    (re.compile(r"https?://\S+"), "URL"),
+    (re.compile(r"\b(e\.g|i\.e|Eqs?|Figs?|vs|al|cf)\."), r"\1"),
+)
+"""What a reader sees of markup."""
+WORD = re.compile(r"[A-Za-z][A-Za-z'’-]*|\d[\d.,]*")
+NUMBER = re.compile(r"(?<![A-Za-z])[\d−-]?\d[\d.,]*")
+FEWEST_WORDS = 4
+"""Words of the shortest sentence; fewer are a label."""
+RESULTS = ("results.md", "results/", "paper.md", "study.md", "values.md", "cliffwalk.md")
+LIMITS = {"readme": (15.0, 0.05, 0.2), "page": (15.0, 0.05, 0.3), "results": (18.0, 0.08, 0.8)}
+"""Words a sentence, share of sentences of more than thirty words, numbers a sentence."""
+NOT_YET = [
+    "../README.md",
+    "cliffwalk.md",
+    "design.md",
+    "discrete.md",
+    "howto/gpu.md",
+    "howto/images.md",
+    "howto/robot.md",
+    "howto/sequences.md",
+    "howto/signal.md",
+    "howto/torchrl_script.md",
+    "maps.md",
+    "methods/README.md",
+    "methods/averaged_ddpg.md",
+    "methods/cer.md",
+    "methods/ddpg.md",
+    "methods/ddpg_radam.md",
+    "methods/decay.md",
+    "methods/geometric.md",
+    "methods/her.md",
+    "methods/hvper.md",
+    "methods/klper.md",
+    "methods/la3p.md",
+    "methods/lap.md",
+    "methods/mpf_per.md",
+    "methods/mpfa_adaptive.md",
+    "methods/mpfa_per.md",
+    "methods/mpfa_plus.md",
+    "methods/mw.md",
+    "methods/pal.md",
+    "methods/per.md",
+    "methods/raise.md",
+    "methods/reaper.md",
+    "methods/ref_er.md",
+    "methods/rud.md",
+    "methods/td_loss.md",
+    "methods/td_reward.md",
+    "methods/uniform_halves.md",
+    "methods/uper.md",
+    "metrics.md",
+    "moving.md",
+    "noise.md",
+    "paper.md",
+    "paper_map.md",
+    "peers.md",
+    "pictures.md",
+    "planners.md",
+    "policies.md",
+    "reference/README.md",
+    "reference/pictures.md",
+    "reference/settings.md",
+    "results.md",
+    "results/study/B.md",
+    "results/study/C.md",
+    "results/study/D.md",
+    "results/study/F.md",
+    "results/study/H.md",
+    "results/study/I.md",
+    "results/study/J.md",
+    "results/study/K.md",
+    "results/study/L.md",
+    "results/values/G.md",
+    "robot.md",
+    "scaling.md",
+    "study.md",
+    "tuning.md",
+    "tuning_diary.md",
+    "values.md",
+    "vector.md",
+    "worlds.md",
+]
+"""Pages whose sentences are still too long, or have too many numbers."""
+
+
+def sentences(text: str) -> list[str]:
+    """Sentences of the prose of a page: no code, tables, titles or pictures."""
+    found = []
+    for block in re.split(r"\n[ \t]*\n|\n(?=[ \t]*(?:[-*+]|\d+\.) )", CODE.sub("\n\n", text)):
+        if block.strip("\n").startswith("    ") and not re.match(r"\s*([-*+]|\d+\.) ", block):
+            continue
+        lines = [line.strip() for line in block.splitlines() if not NO_PROSE.match(line)]
+        line = re.sub(r"^([-*+]|\d+\.) ", "", " ".join(lines))
+        for markup, shown in SHOWN:
+            line = markup.sub(shown, line)
+        found += re.split(r"(?<=[.!?])\s+(?=[A-Z\"“(\d])", line)
+    return [each for each in found if len(WORD.findall(each)) >= FEWEST_WORDS]
+
+
+def measured(text: str) -> tuple[float, float, float]:
+    """Words a sentence, share of more than thirty words, and numbers a sentence."""
+    words = [len(WORD.findall(each)) for each in sentences(text)]
+    numbers = [len(NUMBER.findall(each)) for each in sentences(text)]
+    count = max(len(words), 1)
+    return sum(words) / count, sum(each > 30 for each in words) / count, sum(numbers) / count
+
+
+def test_prose_is_measured_without_code_tables_and_titles() -> None:
+    text = "# Title\n\nOne of `two words` has 3 numbers, 0.5 and 7. Here are four more."
+    text += "\n\n| a table of 9 words | is no prose |\n\n    code with 8 numbers\n"
+    text += "\n- An item [of a list](page.md) is\n  prose.\n\n```bash\nmake 1 2 3 4 5\n```\n"
+    assert [len(WORD.findall(each)) for each in sentences(text)] == [9, 4, 7]
+    assert measured(text) == (20 / 3, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("page", [page for page in TEXTS if page not in NOT_YET])
+def test_sentences_are_short_and_have_few_numbers(page: str) -> None:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    kind = "results" if page.startswith(RESULTS) else "page"
+    limits = LIMITS["readme" if page == "../README.md" else kind]
+    found = measured(text)
+    assert all(each <= limit for each, limit in zip(found, limits, strict=True)), (found, limits)
