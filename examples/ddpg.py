@@ -138,9 +138,7 @@ def policy_of(actor: TensorDictModule, **card: object) -> Policy:
     return Policy.from_layers(
         actor.module.layers(),
         card={"learner": "ddpg", "method": "mpfa_per", **card},
-        env_arguments={
-            name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")
-        },
+        env_arguments={name: ROOMS_TASK[name] for name in ("physics", "memory", "clearance")},
     )
 
 

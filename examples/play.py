@@ -106,7 +106,7 @@ def race(policy: Policy, episode: WorldTask, window: Window, **env_arguments: An
     Returns:
         Who was at the goal first; None if the race was left.
     """
-    arguments = {**policy.env_arguments, "collision_distance": "contact", **env_arguments}
+    arguments = {**policy.env_arguments, "contact": True, **env_arguments}
     you, rival = Racer(episode, **arguments), Racer(episode, **arguments)
     with closing(you.env), closing(rival.env):
         while you.running or rival.running:

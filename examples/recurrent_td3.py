@@ -194,7 +194,7 @@ class Driving:
 
 def success_of(actor: Actor, worlds: str) -> float:
     """Share of the episodes in these worlds that reach the goal."""
-    arguments = {name: TASK[name] for name in ("physics", "memory", "closeness_distance")}
+    arguments = {name: TASK[name] for name in ("physics", "memory", "clearance")}
     results = evaluate(Driving(actor), worlds, episodes=EPISODES, **arguments)
     return sum(each.success for each in results) / len(results)
 

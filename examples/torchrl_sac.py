@@ -35,7 +35,7 @@ ACTIONS_PER_UPDATE = 4
 """Actions of all robots together."""
 STEPS = 4
 """Actions of each robot between two rounds of updates."""
-SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")}
+SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "clearance")}
 """Arguments of the environment that a policy needs wherever it drives."""
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.speed.bullet_world import BulletWorld
 from benchmarks.speed.timing import Call, Entry, entry, seconds_per_call, take_turns
-from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, World
+from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, TaskConfig, World
 from mpfa_envs.paths.lengths import grid_for, is_reachable, shortest_length
 from mpfa_envs.planners import astar_path
 from mpfa_envs.render import render_trajectories, tiled
@@ -144,7 +144,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
         How the episode ended and the path of the robot.
     """
     start, goal = options["start"][:2], options["goal"]
-    for radius in (PAPER_TASK["collision_distance"], env.config.robot.radius):
+    for radius in (TaskConfig(**PAPER_TASK).collision_distance, env.config.robot.radius):
         path = astar_path(grid_for(env.world, radius), start, goal)
         if path is not None:
             return _follow(env, options, path[1:])
@@ -199,13 +199,12 @@ def describe_world(world: World) -> dict[str, float]:
         "path at 0.35 m": sum(is_reachable(world, 0.35, p.start[:2], p.goal) for p in pairs)
         / PAIRS,
     }
-    for name, rule, drive in (
-        ("straight fails, 0.35 m", 0.35, drive_straight),
-        ("straight fails, contact", "contact", drive_straight),
-        ("A* fails, contact", "contact", drive_shortest_path),
+    for name, contact, drive in (
+        ("straight fails, 0.35 m", False, drive_straight),
+        ("straight fails, contact", True, drive_straight),
+        ("A* fails, contact", True, drive_shortest_path),
     ):
-        task = {**PAPER_TASK, "collision_distance": rule}
-        env = NavigationEnv(world=world, physics="kinematic", **task)
+        env = NavigationEnv(world=world, physics="kinematic", contact=contact, **PAPER_TASK)
         fails = [drive(env, pair._asdict())[0] != "success" for pair in pairs]
         row[name] = sum(fails) / PAIRS
     return row

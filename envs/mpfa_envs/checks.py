@@ -42,6 +42,14 @@ def check_positive(name: str, value: Any) -> float:
     return number
 
 
+def check_not_negative(name: str, value: Any) -> float:
+    """A finite number that is zero or above."""
+    number = check_number(name, value)
+    if number < 0.0:
+        raise ValueError(f"{name} must not be negative, got {value!r}")
+    return number
+
+
 def check_share(name: str, value: Any) -> float:
     """A number in [0, 1]."""
     number = check_number(name, value)

@@ -54,19 +54,14 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         **seen,
         # The lidar saturates where the training ends an episode, and shows all distances above; a
         # robot that can stop may drive on from there, and must know how near it is.
-        "closeness_distance": robot.radius if robot.can_stop else collision_distance(settings),
+        "closeness_distance": robot.radius + (0.0 if robot.can_stop else settings.clearance),
     }
-
-
-def collision_distance(settings: EnvironmentSettings) -> float:
-    """Distance of the robot's center from an obstacle that training counts as a collision [m]."""
-    return resolve_robot(settings.robot).radius + settings.clearance
 
 
 def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     """Return the task to learn: what a policy needs, rewards, and ends of an episode."""
     return {
-        "collision_distance": collision_distance(settings),
+        "clearance": settings.clearance,
         "progress": settings.progress,
         "progress_scale": settings.progress_scale,
         "detour_chance": settings.detour_chance,

@@ -44,9 +44,7 @@ def test_the_episode_ends_at_the_time_step_at_the_goal() -> None:
 
 
 def test_a_held_action_cannot_pass_through_an_obstacle() -> None:
-    env = NavigationEnv(
-        world="B", physics="kinematic", collision_distance="contact", action_repeat=100
-    )
+    env = NavigationEnv(world="B", physics="kinematic", contact=True, action_repeat=100)
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (4.0, 0.0)})
     *_, terminated, _, info = env.step([1.0, 1.0])
     assert terminated and info["collision"]

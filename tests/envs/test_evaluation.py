@@ -167,9 +167,9 @@ def test_a_policys_env_arguments_hold_unless_others_are_given(
     learned |= {"progress": "shortest_path", "lidar": {"sectors": 18}}
     policy = steering_policy(**learned)
     evaluate(policy, "A", episodes=1)
-    evaluate(policy, "A", episodes=1, action_repeat=3, collision_distance=0.3)
+    evaluate(policy, "A", episodes=1, action_repeat=3, contact=False, clearance=0.195)
     first, second = made
-    expected = {**learned, "collision_distance": "contact", "physics": "kinematic"}
+    expected = {**learned, "contact": True, "physics": "kinematic"}
     assert first.config == TaskConfig(**{**expected, "max_steps": first.config.max_steps})
     assert (first.config.max_steps, first.config.action_repeat) == (7, 2)
     assert second.config.action_repeat == 3

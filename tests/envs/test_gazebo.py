@@ -29,7 +29,7 @@ def test_a_benchmark_world_is_the_same_by_file_and_numbers(tmp_path):
     assert len(world.cylinders) == len(expected.cylinders)
     for found, wanted in zip(world.cylinders, expected.cylinders, strict=True):
         assert (found.x, found.y, found.radius) == pytest.approx((wanted.x, wanted.y, 0.075))
-    env = NavigationEnv(world=world, physics="kinematic", collision_distance="contact")
+    env = NavigationEnv(world=world, physics="kinematic", contact=True)
     env.reset(options=barn_task()._asdict())
 
 

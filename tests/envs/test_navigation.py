@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -149,10 +150,12 @@ def test_the_goal_ends_an_episode_with_success() -> None:
     assert info["sim_time"] == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize(("rule", "distance"), [(None, 0.25), ("contact", 0.18), (0.4, 0.4)])
-def test_a_collision_ends_an_episode_at_its_distance(rule: object, distance: float) -> None:
+@pytest.mark.parametrize(
+    ("rule", "distance"), [({}, 0.25), ({"contact": True}, 0.18), ({"clearance": 0.22}, 0.4)]
+)
+def test_a_collision_ends_an_episode_at_its_distance(rule: dict[str, Any], distance: float) -> None:
     world = World(name="post", boxes=(Box(1.0, -0.5, 2.0, 0.5),))
-    env = paper_env(world=world, physics="kinematic", collision_distance=rule)
+    env = paper_env(world=world, physics="kinematic", **{"clearance": 0.07, **rule})
     env.reset(options=STRAIGHT)
     while True:
         _, reward, terminated, truncated, info = env.step([1.0, 1.0])
@@ -253,9 +256,7 @@ def test_a_goal_reached_in_the_last_step_is_no_timeout() -> None:
 
 
 def test_a_robot_at_the_very_collision_distance_has_collided() -> None:
-    env = NavigationEnv(
-        physics="kinematic", time_step=0.125, action_repeat=1, collision_distance=0.25
-    )
+    env = NavigationEnv(physics="kinematic", time_step=0.125, action_repeat=1, clearance=0.07)
     # A step is 1/16 m: 12 of them are exact.
     env.reset(options={"start": (4.0, 0.0, 0.0), "goal": (-4.0, 0.0)})
     ended = [env.step([1.0, 1.0])[2] for _ in range(12)]

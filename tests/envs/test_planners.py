@@ -220,7 +220,7 @@ def test_pursuit_turns_from_a_wall_that_its_arc_would_meet() -> None:
     # The path leads into the wall on the left, which no planner would let it.
     pursuit = PurePursuit([(0.0, 0.0), (0.5, 0.4)], TURTLEBOT, grid)
     x, y, heading = 0.0, 0.0, 0.0
-    with NavigationEnv(world=wall, physics="kinematic", collision_distance="contact") as env:
+    with NavigationEnv(world=wall, physics="kinematic", contact=True) as env:
         env.reset(options={"start": (x, y, heading), "goal": (4.0, 0.0)})
         for _ in range(4):
             *_, info = env.step(np.array(pursuit.act(x, y, heading), np.float32))

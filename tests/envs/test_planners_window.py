@@ -227,7 +227,7 @@ def test_a_map_leads_it_out_of_a_pocket() -> None:
     pocket = World(name="pocket", boxes=walls)
     success = {}
     for memory in ("none", "map"):
-        task = {"memory": memory, "collision_distance": "contact"}
+        task = {"memory": memory, "contact": True}
         with NavigationEnv(world=pocket, physics="kinematic", **task) as env:
             *_, info = drive_to_end(env, DynamicWindow(memory=memory), goal=(3.0, 0.0))
         success[memory] = info["success"]

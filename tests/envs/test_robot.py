@@ -114,7 +114,6 @@ def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
 def test_the_turtlebot2_has_the_measures_of_the_paper() -> None:
     robot = ROBOTS["turtlebot2"]
     assert (robot.radius, robot.wheel_base, robot.wheel_radius) == (0.18, 0.23, 0.035)
-    assert robot.collision_distance == 0.25
     assert robot.max_angular_speed == pytest.approx(1.9565, abs=1e-4)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -9,8 +10,17 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
 
-from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, generate_world
+from mpfa_envs import (
+    ROBOTS,
+    ROOMS_TASK,
+    NavigationEnv,
+    RobotModel,
+    TaskConfig,
+    VectorNavigationEnv,
+    generate_world,
+)
 from mpfa_envs.generators.generate import generator_tasks
+from mpfa_envs.robots.model import resolve_robot
 from mpfa_envs.sensing.observation import INFO_TYPES
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
@@ -38,6 +48,22 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
         assert env.world == many.worlds[robot]
         assert env.task == many.tasks[robot]
     many.close()
+
+
+@pytest.mark.parametrize("robot", [*ROBOTS, replace(ROBOTS["kobuki"], name="cart", radius=0.28)])
+def test_the_task_keeps_its_clearance_of_the_rim_of_each_robot(robot: str | RobotModel) -> None:
+    task = TaskConfig(
+        **{name: ROOMS_TASK[name] for name in ROOMS_TASK.keys() - {"world", "max_goal_distance"}},
+        robot=robot,
+    )
+    radius = resolve_robot(robot).radius
+    assert task.collision_distance == pytest.approx(radius + 0.05, abs=1e-12)
+    assert task.closeness_distance == pytest.approx(radius + 0.05, abs=1e-12)
+    judged = replace(task, contact=True)
+    assert (judged.collision_distance, judged.closeness_distance) == (
+        radius,
+        task.closeness_distance,
+    )
 
 
 def test_a_seed_repeats_worlds_that_change_with_each_episode(env: NavigationEnv) -> None:

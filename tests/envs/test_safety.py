@@ -62,7 +62,7 @@ def drive_at_random(
     """Least clearance of robots that hold a random action for a while [m]."""
     near = ROBOTS[robot].radius if isinstance(robot, str) else robot.radius
     arguments = {"robot": robot, "physics": physics, "closeness_distance": near, "max_steps": 400}
-    arguments |= {"collision_distance": "contact"}
+    arguments |= {"contact": True}
     arguments["lidar"] = {"field_of_view": view, "sectors": round(view / 10.0)}
     keep = TaskConfig(**arguments).make_filter()
     rng = np.random.default_rng(0)
@@ -127,7 +127,7 @@ def test_a_random_policy_touches_nothing_on_wheels(robot: str, world: str) -> No
 
 
 def test_without_the_filter_a_random_policy_does_touch() -> None:
-    arguments = task(collision_distance="contact")
+    arguments = task(contact=True)
     env = VectorNavigationEnv(20, world="mazes", **arguments)
     env.reset(seed=0)
     ahead = np.ones((20, 2), np.float32)
@@ -148,7 +148,7 @@ def test_a_robot_brakes_in_time_before_a_wall() -> None:
     config = TaskConfig(**task())
     keep, robot = config.make_filter(), config.robot
     start = -3.0
-    env = VectorNavigationEnv(1, world=WALL, **task(collision_distance="contact"))
+    env = VectorNavigationEnv(1, world=WALL, **task(contact=True))
     seen, infos = env.reset(options={"tasks": [((start, 0.0, 0.0), (3.0, 4.5))]})
     fastest = 0.0
     for _ in range(60):
@@ -208,7 +208,7 @@ def test_where_no_circle_is_free_it_turns_to_the_freer_side(side: float) -> None
 
 
 def test_a_robot_that_cannot_stop_circles_among_walls_for_ever() -> None:
-    arguments = task("turtlebot2", lidar=AROUND, collision_distance="contact", max_steps=3000)
+    arguments = task("turtlebot2", lidar=AROUND, contact=True, max_steps=3000)
     keep = TaskConfig(**arguments).make_filter()
     box = World(name="box", size=(2.0, 2.0))
     env = VectorNavigationEnv(1, world=box, goal_radius=0.05, min_goal_distance=0.2, **arguments)
@@ -232,7 +232,7 @@ def test_rows_do_not_depend_on_each_other() -> None:
 
 
 def test_what_a_larger_clearance_keeps_is_farther_away() -> None:
-    arguments = task(collision_distance="contact")
+    arguments = task(contact=True)
     least = {}
     for clearance in (0.03, 0.15):
         config = TaskConfig(**arguments)

@@ -168,7 +168,7 @@ def frozen(world: World, walkers: np.ndarray) -> World:
 
 
 def test_walkers_are_seen_and_run_into_as_cylinders_would_be() -> None:
-    env = VectorNavigationEnv(1, world=BUSY, physics="kinematic", collision_distance="contact")
+    env = VectorNavigationEnv(1, world=BUSY, physics="kinematic", contact=True)
     rng, collisions = np.random.default_rng(0), 0
     env.reset(seed=3)
     for _ in range(300):

@@ -130,12 +130,12 @@ def test_a_task_with_a_too_narrow_path_is_rejected() -> None:
         pytest.raises(ValueError, match=r"goal must be .* collision_distance = 0.25 m .*\(2.0, 0"),
     ):
         env.reset(options=task)
-    with NavigationEnv(world=gap, physics="kinematic", collision_distance="contact") as env:
+    with NavigationEnv(world=gap, physics="kinematic", contact=True) as env:
         env.reset(options=task)
 
 
 def test_a_goal_beside_a_wall_can_be_reached() -> None:
-    with NavigationEnv(physics="kinematic", collision_distance=0.35) as env:
+    with NavigationEnv(physics="kinematic", clearance=0.17) as env:
         assert drive_to_end(env, full_speed, goal=(4.8, 0.0))[-1]["success"]
 
 

@@ -14,12 +14,19 @@ from gymnasium.spaces import Box as BoxSpace
 from mpfa_envs.checks import (
     check_choice,
     check_count,
+    check_not_negative,
     check_number,
     check_positive,
     check_share,
 )
 from mpfa_envs.robots.drives import Physics
-from mpfa_envs.robots.model import ROBOTS, RobotModel, resolve_collision_distance, resolve_robot
+from mpfa_envs.robots.model import (
+    PAPER_CLEARANCE,
+    ROBOTS,
+    TRAINING_CLEARANCE,
+    RobotModel,
+    resolve_robot,
+)
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
@@ -34,8 +41,7 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "action_repeat": 1,
         "progress_scale": 15.0,
-        "collision_distance": 0.35,
-        "closeness_distance": 0.35,
+        "clearance": PAPER_CLEARANCE,
         "detour_chance": 0.0,
     }
 )
@@ -46,9 +52,11 @@ The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, 
 _MOST_STEPS: Final = 1_000_000
 """Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
+    "contact": partial(check_choice, kinds=Literal[True, False]),
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
     "progress_scale": check_number,
+    "clearance": check_not_negative,
     "max_steps": partial(check_count, most=_MOST_STEPS),
     "time_step": check_positive,
     "action_repeat": check_count,
@@ -61,6 +69,8 @@ _EMPTY: Final = World(name="empty")
 _AHEAD: Final = 180.0
 """The field of view that a lidar has by default [deg]."""
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
+_DESCRIBED: Final = ("robot", "clearance", "contact", "reward", "progress_scale", "lidar")
+"""Fields that a description has in another form."""
 _PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale", "step_cost")
 
 
@@ -99,15 +109,18 @@ class TaskConfig:
     max_steps: int = 500
     """Time limit of an episode in time steps."""
     time_step: float = 0.1
-    """Duration of a time step [s]; the robot must not drive collision_distance in less."""
+    """Duration of a time step [s], in which the robot must not drive farther than its
+    :attr:`collision_distance`."""
     action_repeat: int = 2
     """Time steps for which an action is held. Their rewards add up, and the episode may end after
     any of them. The default is half as many decisions as time steps."""
     goal_radius: float = 0.5
     """Distance of the robot's center from the goal that reaches it, walls or not [m]."""
-    collision_distance: float = None  # type: ignore[assignment]
-    """Distance of the robot's center from an obstacle or wall that is a collision [m]. None: the
-    robot's radius and 0.07 m, 0.25 m for the TurtleBot2. ``"contact"``: the robot's radius."""
+    clearance: float = TRAINING_CLEARANCE
+    """Clearance of the robot's rim from obstacles and walls, below which an episode ends with a
+    collision [m]."""
+    contact: bool = False
+    """True if only a rim that touches is a collision, as in evaluations."""
     progress_scale: float = PROGRESS_SCALE
     """The paper's ε_p in Eq. (25), reward per meter of approach [1/m]."""
     progress: Progress = "straight_line"
@@ -133,8 +146,8 @@ class TaskConfig:
     """Errors of the lidar, the wheels, the time and the odometry, none by default: a
     :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
     closeness_distance: float = None  # type: ignore[assignment]
-    """A range of this or less has closeness one [m]. None: the default of collision_distance,
-    whatever that is."""
+    """A range of this or less has closeness one [m]. None: the robot's radius and the clearance,
+    with ``contact`` too."""
     min_goal_distance: float = 2.0
     """Least distance between a sampled start and goal [m]."""
     detour_chance: float = 0.8
@@ -143,11 +156,10 @@ class TaskConfig:
     def __post_init__(self) -> None:
         """Check all fields; the first that is out of its range is named."""
         robot = resolve_robot(self.robot)
-        distance = resolve_collision_distance(self.collision_distance, robot)
-        if self.closeness_distance is None:
-            self._set("closeness_distance", robot.collision_distance)
         self._set("robot", robot)
-        self._set("collision_distance", distance)
+        if self.closeness_distance is None:
+            clearance = check_not_negative("clearance", self.clearance)
+            self._set("closeness_distance", round(robot.radius + clearance, 9))
         self._set("noise", resolve_noise(self.noise))
         for name, check in _CHECKS.items():
             self._set(name, check(name, getattr(self, name)))
@@ -163,11 +175,16 @@ class TaskConfig:
             raise ValueError(
                 f"time_step must be at most {self.collision_distance / fastest:.4g} s, in which "
                 f"{robot.name!r} drives no farther than collision_distance = "
-                f"{self.collision_distance} m at its fastest, got {self.time_step}"
+                f"{self.collision_distance:g} m at its fastest, got {self.time_step}"
             )
         self._set("lidar", self._read_lidar())
         # Building these checks the fields that they are made from.
         _ = self.reward_function, self.observation_slices
+
+    @property
+    def collision_distance(self) -> float:
+        """Distance of the robot's center from an obstacle or wall that is a collision [m]."""
+        return self.robot.radius + (0.0 if self.contact else self.clearance)
 
     @property
     def action_time(self) -> float:
@@ -257,8 +274,9 @@ class TaskConfig:
         described = {
             each.name: getattr(self, each.name)
             for each in fields(self)
-            if each.name not in ("robot", "reward", "progress_scale", "lidar")
+            if each.name not in _DESCRIBED
         }
+        described["collision_distance"] = self.collision_distance
         robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
         described.update({f"robot.{name}": value and float(value) for name, value in robot.items()})

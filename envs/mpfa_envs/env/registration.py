@@ -30,8 +30,7 @@ ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
         "progress": "shortest_path",
         "max_goal_distance": 20.0,
         "memory": "map",
-        "collision_distance": 0.23,
-        "closeness_distance": 0.23,
+        "clearance": 0.05,
     }
 )
 """Arguments of :class:`~mpfa_envs.NavigationEnv` and :class:`~mpfa_envs.VectorNavigationEnv` for

@@ -245,7 +245,7 @@ def run_tasks(
         for number, each in enumerate(tasks)
     ]
     results: dict[int, EpisodeResult] = {}
-    arguments = {"collision_distance": "contact", **env_arguments}
+    arguments = {"contact": True, **env_arguments}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
     with ExitStack() as opened, _progress_bar(len(tasks) if progress_bar else None) as advance:
         fleets = []

@@ -124,7 +124,7 @@ def drive_episode(
     Yields:
         Each decision before it is carried out, and the end.
     """
-    arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
+    arguments = {"contact": True, **getattr(policy, "env_arguments", {})}
     arguments |= episode.limit({**arguments, **env_arguments})
     arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED

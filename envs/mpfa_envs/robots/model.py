@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.checks import all_finite, check_number, check_positive, did_you_mean
+from mpfa_envs.checks import check_number, check_positive, did_you_mean
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 TRAINING_CLEARANCE: Final = 0.07
 """Clearance of the robot's rim below which training counts a collision [m]."""
 PAPER_CLEARANCE: Final = 0.17
-"""Margin of the paper, 0.35 m from the center of a TurtleBot2 [m]."""
+"""Clearance of the paper, 0.35 m from the center of a TurtleBot2 [m].
+
+A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,15 +116,6 @@ class RobotModel:
         change = math.inf if self.wheel_acceleration is None else self.wheel_acceleration
         across = math.inf if self.turn_limit is None else 0.5 * self.turn_limit * self.wheel_base
         return WheelLimits(self.min_wheel_speed, self.max_wheel_speed, across, change)
-
-    @property
-    def collision_distance(self) -> float:
-        """Distance of the center from an obstacle that training counts as a collision [m].
-
-        Its radius and a clearance of 0.07 m. At the paper's 0.17 m, 0.35 m for the TurtleBot2, a
-        passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it.
-        """
-        return round(self.radius + TRAINING_CLEARANCE, 9)
 
     def wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
         """Read an action.
@@ -303,19 +297,3 @@ def resolve_robot(robot: str | RobotModel) -> RobotModel:
         return ROBOTS[robot]
     hint = f" ({question})" if (question := did_you_mean(robot, ROBOTS)) else ""
     raise ValueError(f"robot must be a RobotModel or one of {sorted(ROBOTS)}, got {robot!r}{hint}")
-
-
-def resolve_collision_distance(
-    value: float | Literal["contact"] | None, robot: RobotModel
-) -> float:
-    """Turn a collision rule into a distance of the robot's center [m]."""
-    if value is None:
-        return robot.collision_distance
-    if isinstance(value, str) and value == "contact":
-        return robot.radius
-    if not (all_finite((value,)) and float(value) >= robot.radius):
-        raise ValueError(
-            "collision_distance must be 'contact', None or at least the robot's radius "
-            f"{robot.radius}, got {value!r}"
-        )
-    return float(value)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_share
+from mpfa_envs.checks import check_count, check_not_negative, check_number, check_share
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,8 +55,7 @@ class RobotNoise:
 
     def __post_init__(self) -> None:
         for name in ("range_noise", "drift"):
-            if check_number(name, getattr(self, name)) < 0.0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)!r}")
+            check_not_negative(name, getattr(self, name))
         check_share("dropout", self.dropout)
         if not 0.0 <= check_number("slip", self.slip) <= _MOST_SLIP:
             raise ValueError(f"slip must be in [0, {_MOST_SLIP}], got {self.slip!r}")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from mpfa_envs.checks import check_number, check_positive
+from mpfa_envs.checks import check_not_negative, check_positive
 from mpfa_envs.ros.inputs import Felt, Seen, Sight, Track
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ class Controller:
         odometry_timeout: float = 0.5,  # [s]
         check_period: float = 0.05,  # longest time from one tick() to the next [s]
     ) -> None:
-        if check_number("stop_distance", stop_distance) < 0.0:
-            raise ValueError(f"stop_distance must not be negative, got {stop_distance}")
+        check_not_negative("stop_distance", stop_distance)
         self.pilot = pilot
         self.stop_distance = stop_distance
         self.scan_timeout = check_positive("scan_timeout", scan_timeout)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.checks import check_count, check_not_negative, check_positive
 from mpfa_envs.robots.model import RobotModel, resolve_robot
 from mpfa_envs.safety.loops import Body, filter_actions
 from mpfa_envs.sensing.observation import Memory, observation_slices
@@ -57,7 +57,7 @@ class SafetyFilter:
     Examples:
         >>> import numpy as np
         >>> from mpfa_envs import NavigationEnv, TaskConfig
-        >>> task = {"robot": "kobuki", "physics": "kinematic", "collision_distance": "contact"}
+        >>> task = {"robot": "kobuki", "physics": "kinematic", "contact": True}
         >>> keep_off = TaskConfig(**task).make_filter()
         >>> env = NavigationEnv(world="D", **task)
         >>> observation, info = env.reset(seed=0)
@@ -84,8 +84,7 @@ class SafetyFilter:
         samples: int = 9,
     ) -> None:
         self.robot = resolve_robot(robot)
-        if check_number("clearance", clearance) < 0.0:
-            raise ValueError(f"clearance must not be negative, got {clearance}")
+        check_not_negative("clearance", clearance)
         self._parts = observation_slices(sectors, memory=memory, history=history)
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")

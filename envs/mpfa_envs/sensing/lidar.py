@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import check_choice, check_count, check_number, check_positive, check_share
+from mpfa_envs.checks import (
+    check_choice,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_share,
+)
 from mpfa_envs.sensing.lidar_loops import cast_rays
 from mpfa_envs.sensing.observation_loops import sector_ranges
 from mpfa_envs.worlds.batch import WorldBatch
@@ -77,9 +83,7 @@ class Lidar:
         self.rays_per_sector = 1 if reduction == "single" else count
         self.reduction: Reduction = check_choice("reduction", reduction, Reduction)
         self.max_range = check_positive("max_range", max_range)
-        self.noise = check_number("noise", noise)
-        if self.noise < 0:
-            raise ValueError(f"noise must not be negative, got {noise}")
+        self.noise = check_not_negative("noise", noise)
         self.field_of_view = check_positive("field_of_view", field_of_view)
         if self.field_of_view > 360.0:
             raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from contextlib import suppress
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +14,7 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
-from mpfa_envs.robots.model import (
-    PAPER_CLEARANCE,
-    RobotModel,
-    resolve_collision_distance,
-    resolve_robot,
-)
+from mpfa_envs.robots.model import PAPER_CLEARANCE, RobotModel, resolve_robot
 from mpfa_envs.worlds.task import START_SLACK, Task
 from mpfa_envs.worlds.world import Box, World
 
@@ -128,7 +123,7 @@ def check_task(
     clearance = world.clearance(x, y)
     if clearance <= collision_distance:
         raise ValueError(
-            f"start must be farther than collision_distance = {collision_distance} m from "
+            f"start must be farther than collision_distance = {collision_distance:g} m from "
             f"obstacles and walls, got {(x, y)} with {clearance:.3f} m"
         )
     if math.dist((x, y), goal) <= goal_radius:
@@ -142,7 +137,7 @@ def check_task(
     if kept > radius and not _can_be_won(world, kept, (x, y), goal, goal_radius):
         raise ValueError(
             f"goal must be within reach of the start {(x, y)} by a path that keeps "
-            f"collision_distance = {collision_distance} m from obstacles and walls, got {goal}"
+            f"collision_distance = {collision_distance:g} m from obstacles and walls, got {goal}"
         )
     return Task((x, y, heading), goal)
 
@@ -205,7 +200,6 @@ def evaluation_pairs(
     seed: int,
     *,
     robot: str | RobotModel = "turtlebot2",
-    collision_distance: float | Literal["contact"] | None = None,
     min_goal_distance: float = 2.0,
 ) -> list[Task]:
     """Sample a fixed list of tasks, the same for everyone with the same arguments.
@@ -214,10 +208,8 @@ def evaluation_pairs(
         world: A name, the path of a YAML file or a world.
         n: Number of tasks.
         seed: Seed of the sampling; the first tasks of a longer list are those of a shorter one.
-        robot: Whose radius counts.
-        collision_distance: What the start, the goal and a path between them keep [m]. None: the
-            paper's, the robot's radius and 0.17 m, whatever it trained with; ``"contact"``: its
-            radius.
+        robot: The robot, whose rim keeps the paper's clearance of 0.17 m at the start, at the goal
+            and on a path between them, whatever it trained with.
         min_goal_distance: Least distance between start and goal [m].
 
     Returns:
@@ -240,11 +232,7 @@ def evaluation_pairs(
     world = resolve_world(world)
     robot = resolve_robot(robot)
     # Not the distance of training: settings may change it, and the tasks must stay the same.
-    distance = (
-        round(robot.radius + PAPER_CLEARANCE, 9)
-        if collision_distance is None
-        else resolve_collision_distance(collision_distance, robot)
-    )
+    distance = round(robot.radius + PAPER_CLEARANCE, 9)
     # An environment with the same seed must not train on these tasks.
     rng = np.random.default_rng((_EVALUATION_STREAM, seed))
     return [

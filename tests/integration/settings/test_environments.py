@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import gymnasium
@@ -94,7 +94,7 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
         physics="kinematic", clearance=0.1, max_steps=40, action_repeat=3
     )
     training = make_training_env("D", settings)
-    judging = NavigationEnv(world="D", collision_distance="contact", **env_arguments(settings))
+    judging = NavigationEnv(world="D", contact=True, **env_arguments(settings))
     training.set_seed(1)
     seen = training.reset()["observation"].numpy()[0]
     task = training.env.tasks[0]
@@ -123,10 +123,7 @@ def test_a_lidar_that_sees_a_whole_turn_is_asked_for_and_mirrored(tmp_path: Path
 def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
     training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
     expected = TaskConfig(physics="kinematic")
-    collision = pytest.approx(expected.collision_distance)
-    assert training.env.config.collision_distance == collision
-    same = {"collision_distance": 0.25, "closeness_distance": 0.25}
-    assert replace(training.env.config, **same) == replace(expected, **same)
+    assert training.env.config == expected
     assert EnvironmentSettings().physics == TaskConfig().physics == "wheels"
     training.close()
 
