@@ -39,7 +39,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     index  name             meaning                                              range
     ====== ================ ==================================================== ==========
     0-17   lidar            closeness ``min(closeness_distance / range, 1)`` of  [0, 1]
-                            18 sectors of 10 degrees, left to right over the front
+                            18 sectors of 10 degrees over the front, left to
+                            right
     18-19  goal_direction   cosine and sine of the goal's direction in the       [-1, 1]
                             robot's frame: an angle would jump at ±π
     20     goal_closeness   ``clip(0.3 / d, 0, 1)`` for the goal's distance d    [0, 1]
