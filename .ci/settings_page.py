@@ -33,10 +33,10 @@ def page() -> str:
     """The page with new tables below its introduction."""
     register()
     introduction = PAGE.read_text(encoding="utf-8").partition(START)[0]
-    head = "default in rooms | default in paper | meaning |\n|---|---|---|---|\n"
     learners = "".join(_learner_row(name) for name in GROUPS["learner"])
     return (
-        f"{introduction}{START}\n| setting | {head}{''.join(_rows())}\n## Learners\n\n"
+        f"{introduction}{START}\n| setting | default | meaning |\n|---|---|---|\n{''.join(_rows())}"
+        "\n## Learners\n\n"
         "What `learner=NAME` sets other than `learner=ddpg`; `regime=rooms` wins over it.\n"
         f"\n| learner | in rooms | in paper | meaning |\n|---|---|---|---|\n{learners}"
         "\n## Methods\n\nWhat a method has beyond `method=mpfa_per`, or another default.\n"
@@ -50,13 +50,12 @@ def _rows() -> Iterator[str]:
     values = [_values(regime) for regime in REGIMES]
     for name, meaning in meanings.items():
         rooms, paper = (_shown(each[name]) for each in values)
-        if rooms != paper:
-            rooms, paper = f"**{rooms}**", f"**{paper}**"
-        yield _row(name, rooms, paper, meaning)
+        default = rooms if rooms == paper else f"rooms: {rooms}<br>paper: {paper}"
+        yield _row(name, default, meaning)
         if name == "curriculum.stages":
             for field, of_a_stage in _meanings(Stage, ""):
                 default = _shown(getattr(Stage(), field))
-                yield _row(f"{name}[].{field}", default, default, of_a_stage)
+                yield _row(f"{name}[].{field}", default, of_a_stage)
 
 
 def _learner_row(learner: str) -> str:
