@@ -12,14 +12,13 @@ PAGES = Path(__file__).resolve().parents[2] / "docs/methods"
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-@pytest.mark.parametrize("page", ["README.md", "mpfa_per.md"])
-def test_examples_of_a_page_run_in_their_order(page, monkeypatch):
+def test_the_examples_of_the_page_run_in_their_order(monkeypatch):
     monkeypatch.setattr("builtins.print", lambda *words: None)
     # What a page adds to the catalogue is gone afterwards.
     monkeypatch.setattr("torchrl_mpfa.methods.METHODS", dict(METHODS))
     names = {"METHODS": dict(METHODS), "Method": Method, "make_replay": make_replay}
     blocks = re.findall(
-        r"```python\n(.*?)```", (PAGES / page).read_text(encoding="utf-8"), re.DOTALL
+        r"```python\n(.*?)```", (PAGES / "README.md").read_text(encoding="utf-8"), re.DOTALL
     )
     assert blocks
     with warnings.catch_warnings():
@@ -28,8 +27,12 @@ def test_examples_of_a_page_run_in_their_order(page, monkeypatch):
             exec(block, names)
 
 
-def test_every_method_has_a_page_and_a_row():
+def test_every_method_has_a_row_and_a_page_or_a_section_of_one():
     table = (PAGES / "README.md").read_text(encoding="utf-8")
-    for name in set(METHODS) - set(ALIASES):
-        assert f"[`{name}`]({name}.md)" in table
-        assert (PAGES / f"{name}.md").exists()
+    links = dict(re.findall(r"^\| \[`(\w+)`\]\((\S+?)\)", table, re.MULTILINE))
+    assert set(links) == set(METHODS) - set(ALIASES)
+    for name, link in links.items():
+        page, _, section = link.partition("#")
+        title = f"## `{section}`" if section else f"# `{name}`"
+        assert section in ("", name)
+        assert re.search(rf"^{title}", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE)

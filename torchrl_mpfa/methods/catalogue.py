@@ -1,6 +1,6 @@
 """Every method by name: a class for each kind of them, and the settings of each.
 
-``docs/methods/`` has a page for each. A method of your own is a subclass of
+``docs/methods/README.md`` links to the page of each. A method of your own is a subclass of
 :class:`~torchrl_mpfa.methods.Method`, and one more entry in :data:`METHODS`.
 """
 
