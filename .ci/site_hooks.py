@@ -3,13 +3,15 @@
 The site's first page is the README, with cards in place of its list of pages. The notebook is a
 page with its outputs. A page may link to any file of the repository: such a file becomes a page
 with its text, which the search leaves out. Formulas become MathML, which browsers show without a
-script, and a picture is a link to itself.
+script, and a picture is a link to itself. The title of the site has the version, and its foot a
+link to the repository, where ``REPOSITORY_URL`` says which.
 """
 
 from __future__ import annotations
 
 import html
 import json
+import os
 import posixpath
 import re
 from pathlib import Path, PurePosixPath
@@ -119,6 +121,16 @@ def notebook_text(text: str) -> str:
     return "\n\n".join(parts)
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Add the version to the title, and the repository, if it is known, to the foot."""
+    package = (ROOT / "torchrl_mpfa" / "__init__.py").read_text(encoding="utf-8")
+    (version,) = re.findall(r'^__version__ = "(.+)"', package, re.MULTILINE)
+    config.site_name = f"{config.site_name} {version}"
+    if address := os.environ.get("REPOSITORY_URL"):
+        config.copyright = f'<a href="{html.escape(address)}">Repository</a>'
+    return config
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the README, the notebook, and what pages link to outside of ``docs/``."""
     wanted = set(_PLACES) | linked_files(home_page(), ".")
@@ -143,7 +155,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to files outside of ``docs/`` to their pages."""
+    """Turn links to files outside of ``docs/`` to their pages, and add words for the search."""
+    page.meta["tags"] = config.extra["search_words"].get(page.file.src_uri)
     if page.file.generated_by is not None:
         return markdown
     uri = page.file.src_uri
