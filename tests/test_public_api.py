@@ -55,9 +55,11 @@ def test_every_argument_of_a_public_name_is_described(name):
     thing = getattr(torchrl_mpfa, name)
     if getattr(thing, "_is_protocol", False):
         return
-    described = inspect.getdoc(thing)
-    # TorchRL's metaclasses add arguments of their own to the signature of a class.
-    function = thing.__init__ if inspect.isclass(thing) else thing
+    function, described = thing, inspect.getdoc(thing)
+    if inspect.isclass(thing):
+        # TorchRL's metaclasses add arguments of their own to the signature of a class.
+        function = thing.__init__
+        described = next(each.__doc__ for each in thing.__mro__ if "__init__" in vars(each))
     for parameter in inspect.signature(function).parameters.values():
         kind, word = parameter.kind, parameter.name
         stars = {kind.VAR_POSITIONAL: r"\*", kind.VAR_KEYWORD: r"\*\*"}.get(kind, "")

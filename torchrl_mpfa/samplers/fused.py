@@ -62,23 +62,18 @@ class SignalSampler(TreeSampler):
 
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
 
+    Further arguments, in their order: see :class:`~torchrl_mpfa.samplers.TreeSampler`, from
+    ``max_capacity`` to ``stratified``. ``eps`` is added once, before the adjustments.
+
     Args:
-        max_capacity: As in :class:`~torchrl_mpfa.samplers.TreeSampler`, like all arguments up to
-            ``device``, and ``stratified``.
-        alpha: Priority exponent :math:`\alpha` of Eq. (8).
-        beta: Importance exponent :math:`\beta` of Eq. (10).
-        eps: :math:`\epsilon` of Eqs. (9) and (21), added once, before the adjustments.
-        dtype: See above.
-        reduction: See above.
-        max_priority_within_buffer: See above.
-        device: See above.
+        *args: Further arguments.
         signals: The signals to fuse, as objects or names.
         fusion: Weights of the signals, see :class:`~torchrl_mpfa.Fusion`; by default equal ones.
         adjustments: Changes of the fused priorities, in order.
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, whatever the capacity.
-        stratified: See above.
+        **kwargs: Further arguments.
 
     Raises:
         ValueError: If an argument is out of its range, or the fusion names a signal that is not
@@ -94,20 +89,12 @@ class SignalSampler(TreeSampler):
 
     def __init__(
         self,
-        max_capacity: int,
-        alpha: float,
-        beta: float,
-        eps: float = 1e-8,
-        dtype: torch.dtype = torch.float,
-        reduction: str = "max",
-        max_priority_within_buffer: bool = False,
-        device: torch.device | str | None = None,
-        *,
+        *args: Any,
         signals: Sequence[Signal | str] = ("td_error",),
         fusion: Fusion | None = None,
         adjustments: Sequence[Adjustment] = (),
         entropy_refresh: float = 1 / 256,
-        stratified: bool = False,
+        **kwargs: Any,
     ) -> None:
         check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self.signals = as_signals(signals)
@@ -129,8 +116,7 @@ class SignalSampler(TreeSampler):
         self._columns: Columns = slice(0)
         self._table: SignalTable | None = None
         self._warned: set[str] = set()
-        rest = dtype, reduction, max_priority_within_buffer, device
-        super().__init__(max_capacity, alpha, beta, eps, *rest, stratified=stratified)
+        super().__init__(*args, **kwargs)
 
     def _init(self) -> None:
         super()._init()

@@ -6,6 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -13,8 +14,9 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.checks import as_mask, generator_on
+from torchrl_mpfa.checks import as_mask, check_counts, generator_on
 from torchrl_mpfa.saving import check_saved, load_safely, open_dump, save_atomically, seal_dump
+from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
 from torchrl_mpfa.storages.table import SignalTable
 
@@ -30,6 +32,17 @@ class SignalStorageMixin:
     Every write of a slot resets its signals, by any writer, so that a transition never has the
     signals of the transition before it. Sampled batches hold no signals. Transitions that do not
     fit are rejected before any of them is written.
+
+    Args:
+        max_size: Capacity ``N``.
+        signals: The signals to keep, as objects or names; those of the paper by default.
+        reward_key: Where the signed reward of a transition is read.
+        allow_nonfinite: Entries that may hold NaN and infinities; none by default.
+        **kwargs: Arguments of TorchRL's storage. With ``ndim=2`` a slot is a step of one of several
+            environments, as in TorchRL, and ``max_size`` must be a multiple of their number.
+
+    Raises:
+        ValueError: If ``max_size`` is not positive, or the signals are none or twice the same.
     """
 
     signal_table: SignalTable
@@ -43,10 +56,25 @@ class SignalStorageMixin:
     needed_keys: Sequence[NestedKey] = ()
     #: Set by the same buffer: entries that its sampler reads as booleans.
     mask_keys: Sequence[NestedKey] = ()
-    _allow_nonfinite: Sequence[NestedKey] = ()
+    _mapped: Mapping[str, Any] = MappingProxyType({})
+    """File of the signals, where they are memory-mapped."""
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
     _rng: torch.Generator | None
+
+    def __init__(
+        self,
+        max_size: int,
+        *,
+        signals: Sequence[Signal | str] = MPFA_SIGNALS,
+        reward_key: NestedKey = ("next", "reward"),
+        allow_nonfinite: Sequence[NestedKey] = (),
+        **kwargs: Any,
+    ) -> None:
+        check_counts(max_size=max_size)
+        self._allow_nonfinite = tuple(allow_nonfinite)
+        self.signal_table = SignalTable(max_size, signals, reward_key=reward_key, **self._mapped)
+        super().__init__(max_size, **kwargs)  # type: ignore[call-arg]
 
     def check(self, data: Any) -> tuple[Tensor | None, Pairs | None]:
         """Check transitions that are about to be written; nothing is changed.

@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict, is_tensor_collection
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.utils._pytree import tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
-from torchrl_mpfa.checks import bounds, check_counts
-from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
+from torchrl_mpfa.checks import bounds
 from torchrl_mpfa.storages.storage import SignalStorageMixin
-from torchrl_mpfa.storages.table import SignalTable
 
 
 class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
     """:class:`~torchrl.data.LazyTensorStorage` with the signals of every slot next to the data.
 
-    Args:
-        max_size: Capacity ``N``.
-        signals: The signals to keep, as objects or names; those of the paper by default.
-        reward_key: Where the signed reward of a transition is read.
-        allow_nonfinite: Entries that may hold NaN and infinities; none by default.
-        **kwargs: Passed to :class:`~torchrl.data.LazyTensorStorage`. With ``ndim=2`` a slot is a
-            step of one of several environments, as in TorchRL, and ``max_size`` must be a multiple
-            of their number.
-
-    Raises:
-        ValueError: If ``max_size`` is not positive, or the signals are none or twice the same.
+    Further arguments and errors: see :class:`~torchrl_mpfa.storages.SignalStorageMixin`.
 
     Examples:
         >>> storage = SignalTensorStorage(1000)
@@ -42,22 +28,8 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
     """
 
     _storage: Any
-
-    def __init__(
-        self,
-        max_size: int,
-        *,
-        signals: Sequence[Signal | str] = MPFA_SIGNALS,
-        reward_key: NestedKey = ("next", "reward"),
-        allow_nonfinite: Sequence[NestedKey] = (),
-        **kwargs: Any,
-    ) -> None:
-        check_counts(max_size=max_size)
-        self._allow_nonfinite = tuple(allow_nonfinite)
-        self.signal_table = SignalTable(max_size, signals, reward_key=reward_key)
-        self._looked_at: Any = None
-        self._where: torch.device | None = None
-        super().__init__(max_size, **kwargs)
+    _looked_at: Any = None
+    _where: torch.device | None = None
 
     def get(self, index: Any) -> Any:
         """Read transitions; a batch of slots takes half of the time of indexing."""
@@ -102,17 +74,15 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
     temporary files of its own. A load writes into the files once the state was found to fit; if
     the disk then fails, the storage is left half loaded.
 
+    Further arguments and errors: see :class:`~torchrl_mpfa.storages.SignalStorageMixin`.
+
     Args:
         max_size: Capacity ``N``.
-        signals: The signals to keep, as objects or names; those of the paper by default.
-        reward_key: Where the signed reward of a transition is read.
-        allow_nonfinite: As in :class:`SignalTensorStorage`.
         scratch_dir: Folder of the memory-mapped files; a temporary one by default.
         existsok: True to overwrite files that an earlier storage left in ``scratch_dir``.
-        **kwargs: As in :class:`SignalTensorStorage`, for :class:`~torchrl.data.LazyMemmapStorage`.
+        **kwargs: Further arguments.
 
     Raises:
-        ValueError: As :class:`SignalTensorStorage`.
         FileExistsError: If ``scratch_dir`` holds the files of an earlier storage and ``existsok``
             is false, or a living storage, of this process or another, uses it.
 
@@ -129,19 +99,12 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         self,
         max_size: int,
         *,
-        signals: Sequence[Signal | str] = MPFA_SIGNALS,
-        reward_key: NestedKey = ("next", "reward"),
-        allow_nonfinite: Sequence[NestedKey] = (),
         scratch_dir: str | Path | None = None,
         existsok: bool = False,
         **kwargs: Any,
     ) -> None:
-        check_counts(max_size=max_size)
-        self._allow_nonfinite = tuple(allow_nonfinite)
-        file = None if scratch_dir is None else Path(scratch_dir) / "signals.memmap"
-        self.signal_table = SignalTable(
-            max_size, signals, reward_key=reward_key, file=file, existsok=existsok
-        )
+        if scratch_dir is not None:
+            self._mapped = {"file": Path(scratch_dir) / "signals.memmap", "existsok": existsok}
         super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
 
     def __getstate__(self) -> Any:
