@@ -113,16 +113,7 @@ def samples_uniformly(method: Method) -> bool:
 
 
 def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
-    """Sample with a method and count.
-
-    Args:
-        method: The method.
-        seed: Seed of the sampling.
-
-    Returns:
-        The transitions, and how often each was sampled relative to uniform sampling, for the critic
-        and, if that has batches of its own, for the actor; each of shape ``[N]``.
-    """
+    """Count samples of a method relative to uniform ones, ``[N]``, for critic and actor."""
     torch.manual_seed(0)
     policy = make_actor(OBSERVATION_SIZE, ACTION_SIZE, width=16, final_init=0.5)
     transitions = make_transitions(policy, count=COUNT)

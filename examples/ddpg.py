@@ -38,14 +38,7 @@ EPISODES = 100
 
 
 def main(arguments: Sequence[str] | None = None) -> Path:
-    """Train, and write the policy that did best in the validation worlds.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        The file of the policy.
-    """
+    """Train; return the file of the policy that did best in the validation worlds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -36,15 +36,7 @@ Winner = Literal["you", "policy", "nobody"]
 
 
 def action_of(keys: Iterable[str], robot: RobotModel) -> NDArray[np.float32]:
-    """The action of some held keys.
-
-    Args:
-        keys: Their names.
-        robot: What they drive.
-
-    Returns:
-        Speeds of the left and the right wheel, ``[2]``, in [-1, 1].
-    """
+    """Return the wheel speeds of some held keys, in [-1, 1], ``[2]``."""
     held = {LETTERS.get(key, key) for key in keys}
     turn = ("right" in held) - ("left" in held)
     slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
@@ -63,12 +55,7 @@ def action_of(keys: Iterable[str], robot: RobotModel) -> NDArray[np.float32]:
 
 
 class Racer:
-    """One robot on its way.
-
-    Args:
-        episode: The task and its world.
-        **env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv`.
-    """
+    """A robot that drives a task, with arguments of :class:`~mpfa_envs.NavigationEnv`."""
 
     def __init__(self, episode: WorldTask, **env_arguments: Any) -> None:
         self.env = NavigationEnv(
@@ -95,17 +82,7 @@ class Racer:
 
 
 def race(policy: Policy, episode: WorldTask, window: Window, **env_arguments: Any) -> Winner | None:
-    """Drive one race.
-
-    Args:
-        policy: The rival.
-        episode: The task and its world.
-        window: Where it is seen, and whose keys are the player's.
-        **env_arguments: Arguments of both environments in place of the policy's.
-
-    Returns:
-        Who was at the goal first; None if the race was left.
-    """
+    """Drive one race; return the first at the goal, None if the player left."""
     arguments = {**policy.env_arguments, "contact": True, **env_arguments}
     you, rival = Racer(episode, **arguments), Racer(episode, **arguments)
     with closing(you.env), closing(rival.env):
@@ -144,14 +121,7 @@ def picture_of(you: Racer, rival: Racer) -> NDArray[np.uint8]:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
-    """Race until the rooms or the player's patience end, and print the score.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Races won by each.
-    """
+    """Race until the rooms or the player's patience end; print and return the races won by each."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -108,11 +108,7 @@ class RecurrentTD3:
         self.updates = 0
 
     def update(self, batch: TensorDictBase) -> Tensor:
-        """Learn from slices that lie one after the other, and write |TD error| to each step.
-
-        Returns:
-            The steps that were learned from, by number.
-        """
+        """Learn from slices, write |TD error| to each step; return the numbers of learned steps."""
         # Where each step is: in which slice, and which step of it.
         last = batch["next", "truncated"].squeeze(-1)
         begins = torch.cat((last.new_ones(1), last[:-1])).nonzero().squeeze(1)
@@ -200,14 +196,7 @@ def success_of(actor: Actor, worlds: str) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> Actor:
-    """Train, and evaluate in worlds that no training saw.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        The policy.
-    """
+    """Train, and evaluate in worlds that no training saw; return the policy."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

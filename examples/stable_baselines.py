@@ -34,11 +34,7 @@ _NOISE = 0.2
 
 
 class Robots(VecEnv):
-    """The robots of a :class:`~mpfa_envs.VectorNavigationEnv` as Stable-Baselines3 wants them.
-
-    Args:
-        env: The robots; a new episode begins in the step in which the last one ends.
-    """
+    """A :class:`~mpfa_envs.VectorNavigationEnv` of the mode SAME_STEP for Stable-Baselines3."""
 
     def __init__(self, env: VectorNavigationEnv) -> None:
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
@@ -95,16 +91,7 @@ class Robots(VecEnv):
 
 
 def make_model(algorithm: str, env: VecEnv, **options: Any) -> OffPolicyAlgorithm:
-    """SAC or TD3 with networks of two layers of 64, and four updates for the robots' actions.
-
-    Args:
-        algorithm: ``sac`` or ``td3``.
-        env: The robots.
-        **options: Arguments of both in the place of these.
-
-    Returns:
-        The model.
-    """
+    """Make SAC or TD3: two layers of 64, four updates for the robots' actions, unless given."""
     chosen: dict[str, Any] = {
         "learning_rate": 1e-3,
         "batch_size": 256,
@@ -128,14 +115,7 @@ def policy_of(model: OffPolicyAlgorithm, *, card: dict[str, Any]) -> Policy:
 
 
 def main(arguments: Sequence[str] | None = None) -> Path:
-    """Train and write the policy.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        The file of the policy.
-    """
+    """Train; return the file of the policy."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

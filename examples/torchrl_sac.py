@@ -76,16 +76,7 @@ def make_buffer(replay: str) -> TensorDictReplayBuffer:
 
 
 def train(env: EnvBase, *, replay: str, actions: int) -> MLP:
-    """Learn, and say now and then what share of the last hundred episodes reached the goal.
-
-    Args:
-        env: The robots, which report ``("info", "success")``.
-        replay: ``uniform`` or ``mpfa``.
-        actions: Of all robots together.
-
-    Returns:
-        The network of means and scales.
-    """
+    """Train, print the success of the last hundred episodes, and return the policy's network."""
     network, actor, critic = make_networks(env)
     loss = {"uniform": SACLoss, "mpfa": SignalSACLoss}[replay](actor, critic, loss_function="l2")
     loss.make_value_estimator(gamma=0.99)
@@ -134,14 +125,7 @@ def policy_of(network: MLP, *, card: dict[str, object]) -> Policy:
 
 
 def main(arguments: Sequence[str] | None = None) -> Path:
-    """Train and write the policy.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        The file of the policy.
-    """
+    """Train; return the file of the policy."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -65,18 +65,7 @@ def make_trainer(
     seed: int = 0,
     progress_bar: bool = True,
 ) -> DDPGTrainer:
-    """Everything that learns.
-
-    Args:
-        sizes: How much is collected, kept and learned.
-        world: Name of a world, or of a generator.
-        num_envs: Number of robots; None: one, without a batch dimension.
-        seed: Seed of networks, environment, noise and replay.
-        progress_bar: Whether to show one.
-
-    Returns:
-        The trainer, ready to train.
-    """
+    """Make a trainer; robots come without a batch dimension if ``num_envs`` is None."""
     torch.manual_seed(seed)
     env = make_env(world=world, num_envs=num_envs, seed=seed)
     spec = env.action_spec_unbatched  # Of one robot, whatever their number.
@@ -114,14 +103,7 @@ def make_trainer(
 
 
 def report(trainer: Trainer) -> list[str]:
-    """What happened: frames, steps, updates of priorities, and what the priorities are made of.
-
-    Args:
-        trainer: A trainer after its training.
-
-    Returns:
-        Lines to print.
-    """
+    """Report frames, steps, updates of priorities, and shares in the priorities, line by line."""
     buffer, stepper = trainer.replay_buffer, trainer.optimization_stepper
     lines = [
         f"frames collected        {trainer.collected_frames}",

@@ -93,14 +93,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Search, and say how to train with what was found.
+    """Search, and print how to train with the best settings.
 
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status: 1 if trials failed one after another to the end, 2 if the folder holds another
-        search, 128 and the number of the signal that stopped it.
+    The exit status is 1 if trials failed one after another to the end, 2 if the folder holds
+    another search, 128 and the number of the signal that stopped the search.
     """
     options = parse(arguments)
     from training.comparison.search import BEST, Plan, run_search

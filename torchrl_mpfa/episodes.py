@@ -45,19 +45,11 @@ def episodes_of(
     *,
     ndim: int = 1,
 ) -> Tensor:
-    """Number episodes that no two share, of steps in the order in which they were written.
+    """Number episodes that no two share by the position of their first step, shape ``[B]``.
 
-    Args:
-        steps: All steps, ``ndim`` dimensions of them.
-        places: Places of those to number along the flattened dimensions, shape ``[B]``.
-        number: Numbers of their episodes, which may begin again, shape ``[B]``.
-        last: True for the last step of an episode, shape ``[B]``.
-        loaded: True for steps from before a load, across which no episode continues without an
-            observation that says so, shape ``[B]``.
-        ndim: Number of dimensions.
-
-    Returns:
-        The position of the first step of each one's episode, shape ``[B]``.
+    Places ``[B]`` are of the flattened ``ndim`` dimensions of the steps, in the order of writing.
+    A ``number`` of an episode may come again, ``last`` marks the last step of an episode. Without
+    observations no episode continues from a ``loaded`` step to another.
 
     Examples:
         >>> from tensordict import TensorDict

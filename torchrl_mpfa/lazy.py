@@ -10,11 +10,7 @@ from typing import Any
 
 
 def find(package: str, name: str, module_of: Mapping[str, str]) -> Any:
-    """Return a public name of a package from its module, or a module of the package.
-
-    Raises:
-        AttributeError: If there is no such name.
-    """
+    """Return a public name of a package from its module, or a module of the package."""
     if name in module_of:
         return getattr(import_module(f"{package}.{module_of[name]}"), name)
     # A module is an attribute of its package only once it was imported.

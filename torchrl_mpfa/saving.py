@@ -100,17 +100,7 @@ def load_safely(
 
 
 def check_saved(part: str, state: Any, names: Iterable[str] = (), /, **exact: Any) -> None:
-    """Reject the saved state of a part that lacks entries, or is of another kind of part.
-
-    Args:
-        part: Name of the part, for the error.
-        state: Its saved state.
-        names: Entries that the state must have.
-        **exact: Entries that must have these values: format, kind, sizes.
-
-    Raises:
-        KeyError: If an entry is missing.
-        ValueError: If the state is no mapping, or an entry has another value.
+    """Reject a part's saved state that lacks one of the names, or has another value of ``exact``.
 
     Examples:
         >>> check_saved("sampler", {"_format": 1}, _format=2)
@@ -130,9 +120,6 @@ def check_saved(part: str, state: Any, names: Iterable[str] = (), /, **exact: An
 
 def check_saved_numbers(part: str, state: Any) -> None:
     """Reject a saved state with a number that is not finite, in any entry.
-
-    Raises:
-        ValueError: If there is one.
 
     Examples:
         >>> check_saved_numbers("learner", {"loss": {"weight": torch.tensor([1.0, torch.inf])}})
@@ -185,13 +172,7 @@ def seal_dump(path: Path, folder: Path) -> None:
 
 
 def open_dump(path: str | Path) -> Path:
-    """Compare every file of a dump with its checksum, and return the folder of the files.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If it is not a complete dump, a file is missing, unknown or damaged, or there is
-            a link, or a file that could execute something when it is read.
-    """
+    """Compare every file of a dump with its checksum, and return the folder of the files."""
     path = Path(path).absolute()
     if not path.is_dir():
         raise FileNotFoundError(f"no such folder: {path}")

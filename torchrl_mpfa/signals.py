@@ -68,12 +68,7 @@ MPFA_SIGNALS: tuple[Signal, ...] = (REWARD, TD_ERROR, ACTION_GRADIENT)
 
 
 def as_signals(signals: Sequence[Signal | str]) -> tuple[Signal, ...]:
-    """Signals from signals or names; the paper's are known by name, any other name is learned.
-
-    Raises:
-        TypeError: If they are a text, or anything but signals and names.
-        ValueError: If there is none, or a name appears twice.
-    """
+    """Return signals of signals or names; names other than the paper's are of learned signals."""
     if isinstance(signals, str) or not all(isinstance(s, str | Signal) for s in signals):
         raise TypeError(f"signals must be a list of signals or their names, got {signals!r}")
     known = {signal.name: signal for signal in MPFA_SIGNALS}

@@ -80,19 +80,7 @@ _KEPT = "`make paper` alone writes it from [the rows that are kept](results/pape
 
 
 def write_page(rows: Rows, page: Path, pictures: Path) -> list[Path]:
-    """Write the page and its figures.
-
-    Args:
-        rows: The kept rows.
-        page: The Markdown file.
-        pictures: Folder of the figures.
-
-    Returns:
-        The files that were written.
-
-    Raises:
-        ValueError: If there are no rows.
-    """
+    """Write the page and its figures from the kept rows; return the files."""
     if not rows.runs:
         raise ValueError(f"{rows.folder} has no rows: python -m benchmarks.paper run makes them")
     made = plot_figures(rows, pictures)

@@ -73,15 +73,7 @@ def read_rows(folder: Path) -> Rows:
 
 
 def keep(runs: Path, folder: Path) -> list[str]:
-    """Add the rows of finished runs to those in a folder.
-
-    Args:
-        runs: Folder of the runs.
-        folder: Folder of the rows.
-
-    Returns:
-        The names of the runs whose rows were added.
-    """
+    """Add the rows of finished runs to those in a folder; return the names of these runs."""
     there = read_rows(folder)
     new = [found for found in finished(runs) if found[1].name not in there.runs]
     tests, curves = [there.tests], [there.curves]

@@ -129,16 +129,9 @@ class Difference:
 def difference(
     found: Mapping[str, pd.DataFrame], ours: str, theirs: str, *, tests: int = 1
 ) -> Difference | None:
-    """Compare the success of two arms, seed by seed if they have enough seeds in common.
+    """Compare the success of two arms, by seed where they have enough seeds in common.
 
-    Args:
-        found: The measures of each run, by arm.
-        ours: An arm.
-        theirs: The arm that is subtracted.
-        tests: Comparisons that are corrected together.
-
-    Returns:
-        The difference; None if an arm has fewer than two runs.
+    Return None if an arm has fewer than two runs. ``tests`` comparisons are corrected together.
     """
     if ours not in found or theirs not in found:
         return None
@@ -161,13 +154,7 @@ def comparison_table(
     pairs: Sequence[tuple[str, str]],
     published: Mapping[str, float] | None = None,
 ) -> str:
-    """Return a table of comparisons that are corrected for each other by Holm's method.
-
-    Args:
-        found: The measures of each run, by arm.
-        pairs: Arms that are compared.
-        published: The paper's success of some arms.
-    """
+    """Return a table of pairs of arms, corrected by Holm's method, with the paper's success."""
     made = [difference(found, *pair, tests=len(pairs)) for pair in pairs]
     corrected = holm(np.array([1.0 if each is None else each.p for each in made]))
     lines = []

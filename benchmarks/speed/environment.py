@@ -75,14 +75,7 @@ def _physics_share(env: NavigationEnv, steps: int) -> float:
 
 
 def measure(*, seconds: float = 2.0) -> list[Entry]:
-    """Measure the environment and the lidar in world D.
-
-    Args:
-        seconds: CPU time for each figure [s].
-
-    Returns:
-        Steps or scans per second, whose ratios are of rates, and shares of moving the robot.
-    """
+    """Measure environment and lidar in world D, each for some CPU time [s]; return rates [1/s]."""
     # Imported here: the rest of the file needs no TorchRL.
     from mpfa_envs import make_navigation_env
 
@@ -121,28 +114,12 @@ def measure(*, seconds: float = 2.0) -> list[Entry]:
 
 
 def drive_straight(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, list[Any]]:
-    """Turn to the goal and drive at it, blind to obstacles.
-
-    Args:
-        env: The environment.
-        options: The task.
-
-    Returns:
-        How the episode ended and the path of the robot.
-    """
+    """Turn to the goal and drive at it, blind to obstacles; return the outcome and the path."""
     return _follow(env, options, [options["goal"]])
 
 
 def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, list[Any]]:
-    """Follow the shortest path, at the paper's collision distance where there is one.
-
-    Args:
-        env: The environment.
-        options: The task.
-
-    Returns:
-        How the episode ended and the path of the robot.
-    """
+    """Follow the shortest path, at the paper's collision distance if possible; return the same."""
     start, goal = options["start"][:2], options["goal"]
     for radius in (TaskConfig(**PAPER_TASK).collision_distance, env.config.robot.radius):
         path = astar_path(grid_for(env.world, radius), start, goal)
@@ -177,14 +154,7 @@ def _distance(info: dict[str, Any], point: tuple[float, float]) -> float:
 
 
 def describe_world(world: World) -> dict[str, float]:
-    """Measure how dense a world is and how far a robot gets in it without seeing.
-
-    Args:
-        world: The world.
-
-    Returns:
-        Figures by name; shares are of 200 tasks of seed 0.
-    """
+    """Measure density and blind success of a world; shares are of 200 tasks of seed 0."""
     pairs = evaluation_pairs(world, PAIRS, seed=0)
     clearances = [world.clearance(x, y) for x in GRID for y in GRID]
     lengths = [shortest_length(world, 0.18, pair.start[:2], pair.goal) for pair in pairs]
@@ -211,14 +181,7 @@ def describe_world(world: World) -> dict[str, float]:
 
 
 def render_worlds(*, size: int = 224) -> np.ndarray[Any, Any]:
-    """Render the built-in worlds, three in a row.
-
-    Args:
-        size: Side of each [px].
-
-    Returns:
-        Picture of shape ``[height, width, 3]``.
-    """
+    """Render the built-in worlds, three in a row, each with this side [px]."""
     pictures = [
         render_trajectories(world, [], [], [], title=name, size=size)
         for name, world in WORLDS.items()

@@ -35,14 +35,7 @@ def _round(tree: Any, capacity: int, device: torch.device) -> Call:
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Sample 256 of 1e5 and of 1e6 slots in proportion to their leaves, and write these.
-
-    Args:
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        Entries for trees and leaves; the ratio of the leaves is against the trees.
-    """
+    """Sample and write 256 of 1e5 and of 1e6 leaves; the ratio is against trees."""
     device = torch.accelerator.current_accelerator(check_available=True) or torch.device("cpu")
     found: list[Entry] = []
     for power in (5, 6):

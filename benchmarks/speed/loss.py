@@ -30,15 +30,7 @@ def make_step(loss: DDPGLoss, batch: TensorDict) -> Call:
 
 
 def measure(*, quick: bool, name: str = "loss") -> list[Entry]:
-    """Compare the losses on one batch with importance weights.
-
-    Args:
-        quick: Fewer and shorter rounds.
-        name: Name of the entry.
-
-    Returns:
-        An entry for each loss; ours has the ratio.
-    """
+    """Compare the losses on one batch with importance weights; ours has the ratio."""
     torch.manual_seed(0)
     batch = make_transitions(BATCH_SIZE)
     batch.set("priority_weight", torch.rand(BATCH_SIZE) * 0.9 + 0.1)

@@ -20,14 +20,7 @@ _SIGMA = 0.2
 
 
 def make_step(method: Method) -> Call:
-    """A step of a method: store, choose, update, priorities.
-
-    Args:
-        method: The method.
-
-    Returns:
-        A function that takes one step.
-    """
+    """Make a function that takes a step of a method: store, choose, update, priorities."""
     torch.manual_seed(0)
     sizes = OBSERVATION_SIZE, ACTION_SIZE
     learner = make_learner(LearnerSettings(), method, *sizes)
@@ -55,14 +48,7 @@ def make_step(method: Method) -> Call:
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Compare a step of each method with one of uniform DDPG.
-
-    Args:
-        quick: Fewer and shorter rounds, and but a few of the methods.
-
-    Returns:
-        An entry ``step_NAME`` for each method.
-    """
+    """Compare a step of each method with one of uniform DDPG; a few methods if quick."""
     chosen = (BASELINE, "mpfa_per", "la3p") if quick else tuple(METHODS)
     calls = {name: make_step(replace(METHODS[name])) for name in chosen if name not in ALIASES}
     timings = take_turns(

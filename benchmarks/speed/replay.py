@@ -124,30 +124,14 @@ def make_stock_update(buffer: TensorDictReplayBuffer, count: int = BATCH_SIZE) -
 def measure_sample_update(
     name: str = "sample_update_1e5", *, capacity: int = 100_000, quick: bool
 ) -> list[Entry]:
-    """Sample a batch, write its signals, update its priorities.
-
-    Args:
-        name: Name of the entry.
-        capacity: Slots of each buffer, all filled.
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each replay; ours has the ratio.
-    """
+    """Sample a batch, write its signals, update its priorities; ours has the ratio."""
     ours = make_mpfa_update(make_mpfa_buffer(capacity))
     stock = make_stock_update(make_stock_buffer(capacity))
     return compare(name, ours, stock, quick=quick)
 
 
 def measure_sample_16x256(*, quick: bool) -> list[Entry]:
-    """Sample and update sixteen batches in one call, as many robots at once ask for.
-
-    Args:
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each replay; ours has the ratio.
-    """
+    """Sample and update sixteen batches in one call, as for many robots; ours has the ratio."""
     count = 16 * BATCH_SIZE
     ours = make_mpfa_update(make_mpfa_buffer(100_000, count), count)
     stock = make_stock_update(make_stock_buffer(100_000, count), count)
@@ -171,17 +155,7 @@ class _Signals:
 def measure_iteration_4x256(
     name: str = "iteration_4x256", *, updates: int = 4, capacity: int = 100_000, quick: bool
 ) -> list[Entry]:
-    """Four batches and their priorities: ours in one call, TorchRL's one by one.
-
-    Args:
-        name: Name of the entry.
-        updates: Batches of an iteration.
-        capacity: Slots of each buffer, all filled.
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each replay; ours has the ratio.
-    """
+    """Update by four batches: ours in one call, TorchRL's one by one."""
     buffer, learner = make_mpfa_buffer(capacity), cast(Learner, _Signals())
     update = make_stock_update(make_stock_buffer(capacity))
 
@@ -198,17 +172,7 @@ def measure_iteration_4x256(
 def measure_extend_one(
     name: str = "extend_one", *, rows: int = 1, capacity: int = 100_000, quick: bool
 ) -> list[Entry]:
-    """Write one transition in a full buffer, checks of what is written included.
-
-    Args:
-        name: Name of the entry.
-        rows: Transitions in a call.
-        capacity: Slots of each buffer.
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each replay; ours has the ratio.
-    """
+    """Write one transition in a full buffer, with the checks of the transition."""
     ours, stock = make_mpfa_buffer(capacity), make_stock_buffer(capacity)
     # A round with other priorities than the first ones, as training has them.
     make_mpfa_update(ours)()
@@ -222,33 +186,17 @@ def measure_extend_one(
 def measure_extend_16(
     name: str = "extend_16", *, capacity: int = 100_000, quick: bool
 ) -> list[Entry]:
-    """Write sixteen transitions in one call, as sixteen environments bring them.
-
-    Args:
-        name: Name of the entry.
-        capacity: Slots of each buffer.
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each replay; ours has the ratio.
-    """
+    """Write sixteen transitions in one call, as from sixteen environments."""
     return measure_extend_one(name, rows=16, capacity=capacity, quick=quick)
 
 
 def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool) -> list[Entry]:
-    """Time of one training step's replay work by capacity, counting of entropies included.
+    """Time the replay work of one training step by capacity, counting of entropies included.
 
     A step writes one transition, samples and updates. The entropies of Eqs. (16)-(17) are counted
     over the whole buffer whenever a fixed share of it was rewritten: each round is as long as it
-    takes for that to happen once, so that the mean of a round holds its full cost.
-
-    Args:
-        capacities: Slots of the buffers, from the smallest to the largest.
-        quick: One round.
-
-    Returns:
-        An entry for each capacity, and ``update_growth``: the largest one's time over the smallest
-        one's, whose ratio is that growth over the growth of log N, the depth of a segment tree.
+    takes for that to happen once, so that the mean of a round holds its full cost. The ratio of
+    ``update_growth`` is the growth of the time over that of log N, the depth of a segment tree.
     """
     steps, periods = {}, {}
     for capacity in capacities:

@@ -53,16 +53,7 @@ CALLS: tuple[tuple[Part, tuple[Part, ...]], ...] = (
 
 
 def profile(*, capacity: int, count: int, calls: int) -> dict[str, float]:
-    """Measure the parts of sampling and updating.
-
-    Args:
-        capacity: Slots of the buffer, all filled.
-        count: Transitions in a batch.
-        calls: How often to sample and update.
-
-    Returns:
-        Median CPU time of each part [s].
-    """
+    """Measure the median CPU time of each part of sampling and updating [s]."""
     step = make_mpfa_update(make_mpfa_buffer(capacity, count), count)
     for _ in range(20):
         step()

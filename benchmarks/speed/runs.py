@@ -26,16 +26,7 @@ _PAUSE = 0.01
 
 
 def measure(*, quick: bool, settings: Sequence[str] = SETTINGS) -> list[Entry]:
-    """Make runs in one process.
-
-    Args:
-        quick: Three of them.
-        settings: Of the runs.
-
-    Returns:
-        ``run_alone``, the wall-clock time of the first, and ``run_of_several``, the median of the
-        others.
-    """
+    """Make runs in one process: ``run_alone``, and ``run_of_several``, the median of the rest."""
     with TemporaryDirectory() as folder:
         worker = LocalWorker()
         jobs = [Job("td3", "mpfa_per", seed, Path(folder)) for seed in range(3 if quick else 6)]

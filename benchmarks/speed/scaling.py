@@ -26,15 +26,7 @@ _WARM = 4
 
 
 def measure(overrides: Sequence[str], seconds: float) -> tuple[float, float]:
-    """Train for a while.
-
-    Args:
-        overrides: Settings of the run.
-        seconds: How long to measure [s].
-
-    Returns:
-        Actions and updates a second.
-    """
+    """Train for some seconds; return actions and updates a second."""
     (settings,) = composed([*overrides, "tracking=off"])
     prepare_process(settings)
     with tempfile.TemporaryDirectory() as folder:

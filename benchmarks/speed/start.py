@@ -22,14 +22,7 @@ COMMANDS: dict[str, list[str]] = {
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Run each command some times in turn.
-
-    Args:
-        quick: Once.
-
-    Returns:
-        An entry for each command, its median; all but the first have ratios to the first.
-    """
+    """Run each command some times in turn; medians have ratios to the first command."""
     found: dict[str, list[float]] = {name: [] for name in COMMANDS}
     for _ in range(1 if quick else 5):
         for name, arguments in COMMANDS.items():

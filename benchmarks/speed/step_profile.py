@@ -26,16 +26,7 @@ PARTS = ("policy and noise", "environment", "write", "sample", "update", "priori
 
 
 def profile(*, width: int, compile: bool, steps: int) -> dict[str, float]:
-    """Measure the parts of a step.
-
-    Args:
-        width: Units of a hidden layer.
-        compile: Whether an update is one compiled program.
-        steps: How many steps.
-
-    Returns:
-        Median CPU time of each part [s].
-    """
+    """Measure the median CPU time of each part of a step [s]."""
     agent, env = Agent(plain=True, width=width, compile=compile), IdleTorchEnv()
     state = env.reset()
     spent: dict[str, list[float]] = defaultdict(list)

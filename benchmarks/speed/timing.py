@@ -87,18 +87,9 @@ def take_turns(
     clock: Clock = time.process_time,
     multiple_of: int = 1,
 ) -> dict[str, Timing]:
-    """Time calls in turns: A B, B A, A B and so on.
+    """Time calls in turns, A B, B A, A B and so on; return as many times of each as rounds.
 
-    Args:
-        calls: What to call, by name.
-        rounds: Number of rounds; each times every call once.
-        seconds: Time that a call is repeated for in each round [s].
-        threads: Threads of PyTorch.
-        clock: What gives the time [s].
-        multiple_of: Calls come in blocks of so many.
-
-    Returns:
-        Times by name, with as many rounds each.
+    A call is repeated in blocks of ``multiple_of`` for some seconds of each round.
     """
     with few_threads(threads):
         counts = {
@@ -133,17 +124,7 @@ def _repetitions(call: Call, seconds: float, *, clock: Clock, multiple_of: int) 
 
 
 def compare(name: str, ours: Call, stock: Call, *, quick: bool) -> list[Entry]:
-    """Time a call of this package against TorchRL's.
-
-    Args:
-        name: Name of the entry; that of TorchRL's gets ``_torchrl`` at its end.
-        ours: The call of this package.
-        stock: The same with TorchRL's parts.
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each; ours has the ratio.
-    """
+    """Time a call of this package, which has the ratio, and TorchRL's, ``NAME_torchrl``."""
     baseline = f"{name}_torchrl"
     timings = take_turns(
         {name: ours, baseline: stock},

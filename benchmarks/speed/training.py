@@ -56,13 +56,7 @@ _PLAIN = {"layer_norm": False, "final_init": None}
 
 
 class Agent:
-    """The parts of this package as a training loop uses them, with MPFA-PER.
-
-    Args:
-        plain: Whether the networks are plain perceptrons, as Stable-Baselines3's are.
-        width: Units of a hidden layer.
-        compile: Whether an update is one compiled program.
-    """
+    """Parts of this package as in a training loop, with MPFA-PER; plain networks are as SB3's."""
 
     learner: Learner
 
@@ -281,27 +275,13 @@ def _compare(ours: dict[str, Call], baseline: str, theirs: Call, *, quick: bool)
 
 
 def measure_train_step(*, quick: bool) -> list[Entry]:
-    """Compare a training step, without the environment's part, with a hand-written one.
-
-    Args:
-        quick: Fewer and shorter rounds, and nothing compiled.
-
-    Returns:
-        An entry for each; ours have the ratio.
-    """
+    """Compare a training step without environment with a plain one; compile unless quick."""
     ours = _variants("train_step", make_step, quick=quick)
     return _compare(ours, "train_step_bare", make_bare_step(), quick=quick)
 
 
 def measure_sb3_step(*, quick: bool) -> list[Entry]:
-    """Compare the whole loop on an idle environment with Stable-Baselines3's, if that is there.
-
-    Args:
-        quick: Fewer and shorter rounds, and nothing compiled.
-
-    Returns:
-        An entry for each; ours have the ratio. None without Stable-Baselines3.
-    """
+    """Compare the loop on an idle environment with Stable-Baselines3's; None without that."""
     if importlib.util.find_spec("stable_baselines3") is None:
         report_progress("sb3_step: left out, stable-baselines3 is not installed")
         return []

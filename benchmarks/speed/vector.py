@@ -106,13 +106,8 @@ def _torchrl_stepper(world: World) -> Call:
 def measure(*, quick: bool) -> list[Entry]:
     """Measure kinematic robots among 30 obstacles, walkers, or 300 cylinders, map, filter, wheels.
 
-    Args:
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        Rates, that of TorchRL's environment among them; the ratios of ``vector_map``,
-        ``vector_walkers``, ``vector_cylinders`` and ``vector_filter`` are their times over that
-        of ``vector_kinematic``.
+    The ratios of ``vector_map``, ``vector_walkers``, ``vector_cylinders`` and ``vector_filter`` are
+    their times over that of ``vector_kinematic``.
     """
     sparse = cluttered("thirty", 1, boxes=20, cylinders=10, size=14.0)
     dense = cluttered("three hundred", 2, cylinders=300, size=20.0)

@@ -49,15 +49,7 @@ def _new_task(name: str) -> Call:
 
 
 def measure(*, quick: bool, names: Sequence[str] = ("mixed",)) -> list[Entry]:
-    """Measure a new world, and grid, task and field in it.
-
-    Args:
-        quick: Fewer and shorter rounds.
-        names: Generators.
-
-    Returns:
-        ``world_NAME`` and ``field_NAME``; and for the first generator ``world_and_field``, the sum.
-    """
+    """Measure a new world and its field; ``world_and_field`` is the sum for the first generator."""
     calls: dict[str, Call] = {}
     for name in names:
         calls |= {f"world_{name}": _new_world(name), f"field_{name}": _new_task(name)}
@@ -71,15 +63,7 @@ def measure(*, quick: bool, names: Sequence[str] = ("mixed",)) -> list[Entry]:
 
 
 def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
-    """Figures of a generator.
-
-    Args:
-        name: Its name.
-        milliseconds: What :func:`measure` found, by name.
-
-    Returns:
-        Figures by the heading of their column.
-    """
+    """Return figures of a generator, with its times [ms], by the heading of their column."""
     worlds = [generate_world(name, seed) for seed in range(WORLDS)]
     obstacles = [world.obstacle_count for world in worlds]
     sides = [side for world in worlds for side in world.size]
@@ -97,16 +81,7 @@ def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
 def render_all(
     worlds: Sequence[World], *, side: int = 224, columns: int = 3
 ) -> np.ndarray[Any, Any]:
-    """Render worlds row by row, with their walkers at the start of an episode.
-
-    Args:
-        worlds: The worlds.
-        side: Longer side of each [px]; as they are, three stand in the column of a page.
-        columns: Worlds in a row.
-
-    Returns:
-        Picture of shape ``[height, width, 3]``.
-    """
+    """Render worlds row by row, each with this longer side [px], walkers at their starts."""
     tiles = []
     for world in worlds:
         env = NavigationEnv(world=world, physics="kinematic")
@@ -128,12 +103,7 @@ def course_of(world: World) -> World:
 
 
 def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:
-    """Write ``generator-NAME.png`` for each generator, and ``barn.png``.
-
-    Args:
-        folder: Where to.
-        names: Generators; none: all of them, and BARN.
-    """
+    """Write ``generator-NAME.png`` for each generator, by default all, and ``barn.png``."""
     from PIL import Image
 
     for name in names or GENERATORS:

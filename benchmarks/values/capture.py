@@ -143,17 +143,9 @@ def capture(source: Source) -> FrozenBuffer:
 
 
 def monte_carlo(env: EnvBase, policy: TensorDictModule, *, gamma: float, seed: int) -> TensorDict:
-    """Drive a policy without noise, and see what it gets.
+    """Drive a policy without noise; return observations, actions and discounted sums of rewards.
 
-    Args:
-        env: Robots in the worlds of the training.
-        policy: The policy.
-        gamma: Discount.
-        seed: Of the worlds, and of which of the states are kept.
-
-    Returns:
-        ``"observation"``, ``"action"`` and ``"value"``, the discounted sum of the rewards from
-        there on; of states from where the end of an episode, or nearly all of the sum, was seen.
+    States are kept where the end of an episode, or nearly all of the sum, was seen.
     """
     env.set_seed(seed)
     state, steps = env.reset(), []

@@ -71,16 +71,9 @@ def read_rows(path: Path) -> pd.DataFrame:
 def make_rows(
     path: Path, arms: Sequence[str], seeds: Sequence[int], *, jobs: int, folder: Path
 ) -> None:
-    """Make the trainings of table G that are missing in a file of rows, and add them to it.
+    """Add the trainings of table G that are missing in a file of rows, in some processes.
 
     Seeds are outside: a table that is cut short has as many of each arm.
-
-    Args:
-        path: The file; it is replaced whole after every few trainings.
-        arms: Names out of :data:`~benchmarks.values.ARMS`.
-        seeds: The seeds.
-        jobs: Processes.
-        folder: Of the frozen buffers.
     """
     rows = read_rows(path)
     made = set(rows[_RUN].itertuples(index=False, name=None))

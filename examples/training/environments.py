@@ -85,18 +85,7 @@ def make_training_env(
     discrete: bool = False,
     hindsight: bool = False,
 ) -> EnvBase:
-    """The environment to learn in.
-
-    Args:
-        world: Of a stage.
-        settings: The environment's settings.
-        robots: Number of robots.
-        discrete: Whether an action is a choice among pairs of wheel speeds.
-        hindsight: Whether transitions have what a goal in hindsight needs.
-
-    Returns:
-        The environment of batch size ``[robots]``, with the entries of ``info`` that a run records.
-    """
+    """Make the training environment of ``[robots]``, with what a run records of ``info``."""
     env = NavigationTorchEnv(
         world=world,
         num_envs=robots,

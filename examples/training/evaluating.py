@@ -93,21 +93,10 @@ def drive(
     noise: RobotNoise | None = None,
     progress: bool,
 ) -> list[Drives]:
-    """Drive a policy through fixed tasks, contact being the only collision.
+    """Drive a policy through fixed tasks of each world, as :func:`mpfa_envs.evaluate`.
 
-    As :func:`mpfa_envs.evaluate`, and the paths are kept.
-
-    Args:
-        policy: The policy, or a planner.
-        worlds: Each what :func:`mpfa_envs.world_tasks` takes.
-        episodes: Number of tasks in each; None: as many as there usually are.
-        seed: Seed of the tasks in a world.
-        physics: ``wheels`` or ``kinematic``; None: as trained.
-        noise: Errors of the robot; None: none.
-        progress: Whether to show a bar.
-
-    Returns:
-        Tasks, results and paths in each of the worlds, the same whichever others there are.
+    Contact is the only collision. Return tasks, results and paths of each world; these do not
+    depend on the other worlds.
     """
     arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
     if physics is not None:

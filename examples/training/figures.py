@@ -57,15 +57,7 @@ def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:
 def plot_search(
     trials: pd.DataFrame, importances: Mapping[str, float], path: Path, *, objective: str
 ) -> None:
-    """Plot the value of each trial with the best so far, and how much each setting mattered.
-
-    Args:
-        trials: A row for each trial: ``number``, ``value``, that of its last evaluation if it was
-            pruned, and ``state``.
-        importances: Shares of the settings, the largest first; empty: no panel.
-        path: The PNG file.
-        objective: What the value is.
-    """
+    """Plot the value of each trial, the best so far, and the importance of each setting."""
     panels = 2 if importances else 1
     figure, axes = new_figure(1, panels, panel=(6.0, 3.6))
     history, ended = axes[0], trials[trials["state"] == "COMPLETE"]

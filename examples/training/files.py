@@ -72,12 +72,7 @@ def lock(folder: Path) -> Iterator[None]:
 
 
 def wait_until_free(folder: Path, seconds: float) -> None:
-    """Wait until no process holds a folder, or so long.
-
-    Args:
-        folder: The folder.
-        seconds: The longest wait [s].
-    """
+    """Wait until no process holds a folder, or for so many seconds."""
     with suppress(Timeout), FileLock(folder / _LOCK, timeout=seconds):
         pass
 

@@ -23,9 +23,6 @@ _PERMUTATIONS = 50_000
 def mean_interval(runs: Array) -> Interval:
     """Return the mean of runs with Student's 95 % interval; NaN ends for one run.
 
-    Args:
-        runs: A number for each run, shape ``[runs]``.
-
     Examples:
         >>> found = mean_interval(np.array([1.0, 2.0, 3.0]))
         >>> round(found.low, 2), found.value, round(found.high, 2)
@@ -39,12 +36,7 @@ def mean_interval(runs: Array) -> Interval:
 
 
 def difference_interval(ours: Array, theirs: Array) -> Interval:
-    """Return the difference of two means with Welch's 95 % interval; NaN ends for one run.
-
-    Args:
-        ours: A number for each run, shape ``[runs]``.
-        theirs: A number for each other run, shape ``[other runs]``.
-    """
+    """Return the difference of two means with Welch's 95 % interval; NaN ends for one run."""
     gap = float(ours.mean() - theirs.mean())
     if min(len(ours), len(theirs)) < 2:
         return Interval(gap, math.nan, math.nan)
@@ -56,10 +48,6 @@ def difference_interval(ours: Array, theirs: Array) -> Interval:
 
 def permutation_p(ours: Array, theirs: Array) -> float:
     """Return p of the two-sided permutation test of the difference between means.
-
-    Args:
-        ours: A number for each run, shape ``[runs]``.
-        theirs: A number for each other run, shape ``[other runs]``.
 
     Examples:
         >>> permutation_p(np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 2.0]))
@@ -79,12 +67,9 @@ def permutation_p(ours: Array, theirs: Array) -> float:
 
 
 def sign_p(gaps: Array) -> float:
-    """Return p of the two-sided permutation test of the signs of differences.
+    """Return p of the two-sided permutation test of the signs of differences, one a seed.
 
     Where neither method is better, the difference of a seed may as well have the other sign.
-
-    Args:
-        gaps: The difference of each seed, shape ``[seeds]``.
 
     Examples:
         >>> sign_p(np.array([1.0, 2.0, 3.0]))
@@ -107,14 +92,9 @@ def _share(samples: tuple[Array, ...], statistic: Any, **options: Any) -> float:
 
 
 def holm(p: Array) -> Array:
-    """Correct p-values for their number by Holm's method.
+    """Correct p-values for their number by Holm's method, in the same order.
 
-    Args:
-        p: Shape ``[comparisons]``.
-
-    Returns:
-        Corrected values in the same order: where all below 0.05 are called differences, the chance
-        that any of them is none is at most 5 %.
+    Where all below 0.05 are called differences, the chance that any of them is none is at most 5 %.
 
     Examples:
         >>> holm(np.array([0.01, 0.04, 0.03])).round(2).tolist()
@@ -128,13 +108,9 @@ def holm(p: Array) -> Array:
 
 
 def detectable(deviation: float, seeds: int, *, level: float = 0.05, power: float = 0.8) -> float:
-    """Return the mean difference that a t-test of paired runs finds with some power.
+    """Return the mean difference that a two-sided t-test of paired runs finds with some power.
 
-    Args:
-        deviation: Standard deviation of the difference from seed to seed.
-        seeds: Number of seeds.
-        level: Level of the two-sided test.
-        power: Chance to find the difference.
+    The deviation is that of the difference from seed to seed.
 
     Examples:
         >>> round(detectable(1.0, 10), 1)

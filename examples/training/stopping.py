@@ -16,10 +16,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class Stop:
     """Flag that a program was asked to stop, with the number of the signal.
 
-    The first signal lets it end in good order; at the second it stops at once.
-
-    Args:
-        answer: What it says to the first one.
+    The first signal lets the program end in good order, and prints the answer; the second stops it.
 
     Examples:
         >>> stop = Stop()

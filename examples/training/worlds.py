@@ -19,19 +19,11 @@ _OF_MANY = re.compile(r"(barn300|[a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
-    """Return the worlds that a command line names.
+    """Return names and paths of the worlds that a command line names, each once.
 
-    Args:
-        words: Names of worlds, paths of world files, spans of a generator's worlds,
-            ``bars:test`` or ``bars:validation``, the worlds of a split, ``barn`` and ``barn:PATH``,
-            those of the benchmark, and ``all``, the test worlds of every generator of worlds in
-            which nothing moves.
-
-    Returns:
-        Names and paths, each of which there is.
-
-    Raises:
-        ValueError: If there is no such world, or one is named twice.
+    Words are names of worlds, paths of world files, spans of a generator's worlds, ``bars:test`` or
+    ``bars:validation``, ``barn`` and ``barn:PATH``, and ``all``: the test worlds of every generator
+    of worlds in which nothing moves.
 
     Examples:
         >>> parse_worlds(["test", "rooms:7-9", "bars:test"])

@@ -267,11 +267,7 @@ def average(critics: list[Any], pasts: Iterable[Any]) -> list[Any]:
 
 
 def last_layer(critic: TensorDictModule) -> str:
-    """Find the name of the layer of a critic that gives Q.
-
-    Raises:
-        ValueError: If its last linear layer does not have one output.
-    """
+    """Find the name of the layer of a critic that gives Q, the last linear layer."""
     linear = [(n, m) for n, m in critic.named_modules() if isinstance(m, nn.Linear)]
     name, layer = linear[-1] if linear else ("", None)
     if layer is None or layer.out_features != 1:

@@ -10,19 +10,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 
 def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tuple[Tensor, Tensor]:
-    """Return the least and greatest action of a spec.
-
-    Args:
-        action_spec: A :class:`~torchrl.data.Bounded` spec, or a :class:`~torchrl.data.Composite`
-            with one entry that is; of a batch of environments, all have the same bounds.
-        action_size: ``A``, if it is known.
-
-    Returns:
-        Lower and upper bounds, each of shape ``[A]``.
-
-    Raises:
-        ValueError: If the spec is not bounded on both sides, of another size, of whole numbers,
-            or not the same for all environments of a batch.
+    """Return the bounds of a spec, or of the one bounded entry in a composite, each ``[A]``.
 
     Examples:
         >>> low, high = action_bounds(Bounded(low=-2.0, high=2.0, shape=(1,)), 1)
@@ -73,11 +61,7 @@ def given_bounds(action_spec: TensorSpec | None, bounds: Any) -> tuple[Tensor, T
 
 
 class ActionScale(nn.Module):
-    r"""Affine map from [-1, 1] to the bounds of actions, :math:`a = c + h \tanh u`.
-
-    Args:
-        low: Least action, shape ``[A]``.
-        high: Greatest action, shape ``[A]``.
+    r"""Affine map from [-1, 1] to the bounds of actions ``[A]``, :math:`a = c + h \tanh u`.
 
     Examples:
         >>> scale = ActionScale(torch.tensor([0.0]), torch.tensor([10.0]))

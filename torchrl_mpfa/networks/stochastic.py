@@ -33,16 +33,8 @@ def sample_tanh_normal(
 
         \ln \pi(a) = \sum_j \ln N(u_j; \mu_j, \sigma_j) - \ln(1 - \tanh^2 u_j) - \ln h_j
 
-    The same numbers as from :class:`~torchrl.modules.TanhNormal` in half the time. Both results
-    can be differentiated by mean and scale.
-
-    Args:
-        loc: Means :math:`\mu`, shape ``[..., A]``.
-        scale: Standard deviations :math:`\sigma`, shape ``[..., A]``.
-        action_scale: The map to the bounds of actions; None: they are in [-1, 1].
-
-    Returns:
-        Actions, shape ``[..., A]``, and their log-densities, shape ``[...]``.
+    The same numbers as from :class:`~torchrl.modules.TanhNormal` in half the time: actions, shape
+    ``[..., A]``, and log-densities, ``[...]``. Both can be differentiated by mean and scale.
 
     Examples:
         >>> action, log_density = sample_tanh_normal(torch.zeros(3, 2), torch.ones(3, 2))
@@ -117,16 +109,10 @@ class StochasticActor(ProbabilisticActor):
     def outputs(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> dict[NestedKey, Tensor]:
-        """Compute the outputs and leave the inputs as they are.
+        """Compute the outputs by key, and leave the inputs as they are.
 
         The action is random under ``set_exploration_type(ExplorationType.RANDOM)``; otherwise it
         is the tanh of the mean, scaled to the bounds of actions.
-
-        Args:
-            inputs: Tensors by key, in a mapping or a tensordict.
-
-        Returns:
-            Outputs by key.
         """
         found: dict[NestedKey, Tensor] = self.module[0].outputs(inputs)
         if (exploration_type() or self.default_interaction_type) is ExplorationType.RANDOM:
@@ -141,15 +127,7 @@ class StochasticActor(ProbabilisticActor):
     def sample(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Sample actions under any exploration type.
-
-        Args:
-            inputs: Tensors by key, in a mapping or a tensordict.
-
-        Returns:
-            Actions, shape ``[..., A]``, their log-densities, ``[...]``, and the means before the
-            tanh, ``[..., A]``.
-        """
+        """Sample actions, ``[..., A]``, log-densities, ``[...]``, and the means before the tanh."""
         found = self.module[0].outputs(inputs)
         loc: Tensor = found["preactivation"]
         return *sample_tanh_normal(loc, found["scale"], self.action_scale), loc

@@ -19,10 +19,6 @@ class Leaves:
     They take the place of the trees on devices other than the CPU, and pass over all leaves. A GPU
     takes as long to start a kernel as to pass over some hundred thousand numbers, and a tree over
     a million slots asks for several kernels on each of its twenty levels.
-
-    Args:
-        capacity: Number of slots.
-        device: Device of the leaves and of all arguments and results.
     """
 
     EMPTY: float

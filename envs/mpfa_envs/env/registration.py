@@ -41,16 +41,9 @@ the task of ``regime=rooms`` for the paper's robot, without a filter and a cost 
 def make_vector(
     num_envs: int, *, max_episode_steps: int | None = None, **arguments: Any
 ) -> VectorNavigationEnv:
-    """The vector of an id, with gymnasium's word for a time limit as ``gymnasium.make`` has it.
+    """Make the vector of an id, with the word of ``gymnasium.make`` for a time limit.
 
-    Args:
-        num_envs: Number of robots.
-        max_episode_steps: Actions after which an episode ends, if ``max_steps`` is not less; None
-            or -1: no other limit than that.
-        **arguments: As :class:`~mpfa_envs.VectorNavigationEnv`.
-
-    Returns:
-        The vector.
+    ``max_episode_steps`` counts actions; None or -1: no other limit than ``max_steps``.
     """
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.vector import VectorNavigationEnv

@@ -80,16 +80,7 @@ def draw_seeds(
     limits: tuple[float, float] | None = None,
     places: Mapping[str, int] | None = None,
 ) -> None:
-    """Draw what :func:`plot_seeds` plots, into axes of matplotlib.
-
-    Args:
-        axis: The axes.
-        runs: Curves of the seeds of each method, by name.
-        level: The level; None: no marks.
-        band: ``"interval"`` or ``"runs"``.
-        limits: Bounds of the values, which cut the band; None: none.
-        places: Number of each method's color; None: in their order.
-    """
+    """Draw what :func:`plot_seeds` plots into axes of matplotlib; ``places`` number the colors."""
     if not any(runs.values()):
         raise ValueError("runs must hold a curve at least")
     if level is not None:

@@ -113,17 +113,7 @@ class Moment(NamedTuple):
 def drive_episode(
     policy: Action | Driver, episode: WorldTask, *, seed: int = 0, **env_arguments: Any
 ) -> Iterator[Moment]:
-    """Drive one episode decision by decision.
-
-    Args:
-        policy: As for :func:`film_episode`.
-        episode: The task and its world.
-        seed: Of the lidar's noise and the walkers.
-        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
-
-    Yields:
-        Each decision before it is carried out, and the end.
-    """
+    """Drive one episode; yield each decision before it is carried out, and the end."""
     arguments = {"contact": True, **getattr(policy, "env_arguments", {})}
     arguments |= episode.limit({**arguments, **env_arguments})
     arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}

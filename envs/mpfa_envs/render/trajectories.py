@@ -147,14 +147,7 @@ def render_methods(
 
 
 def shown_episodes(outcomes: Sequence[str], *, most: int) -> list[int]:
-    """Choose the episodes whose paths are shown, evenly spaced among those of their kind.
-
-    Args:
-        outcomes: How each episode ended.
-        most: How many to choose.
-
-    Returns:
-        Their numbers, in order: failures at least up to half of ``most``, and successes.
+    """Choose ``most`` episodes to show, evenly spaced among those of a kind; up to half failures.
 
     Examples:
         >>> from mpfa_envs.render.trajectories import shown_episodes

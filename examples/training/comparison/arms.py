@@ -48,16 +48,7 @@ def parse_arms(texts: Sequence[str]) -> list[Arm]:
 
 
 def parse_arm(text: str) -> Arm:
-    """Parse an arm of the command line.
-
-    Args:
-        text: ``NAME:SETTING=VALUE,SETTING=VALUE``; commas in brackets or quotes are of the value.
-
-    Returns:
-        The arm.
-
-    Raises:
-        ValueError: If it is no such thing, or a setting is unknown or given by the comparison.
+    """Parse an arm, ``NAME:SETTING=VALUE,SETTING=VALUE``; commas in brackets are of the value.
 
     Examples:
         >>> parse_arm("short:robots=1,curriculum.stages=[{world: A, actions: 500}]").settings

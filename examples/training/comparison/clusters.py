@@ -131,14 +131,9 @@ class _Host:
 
 @contextmanager
 def connected(address: str | None) -> Iterator[None]:
-    """Use a cluster.
+    """Use a cluster by the address of its head, as ``ray.init`` takes the address.
 
-    Args:
-        address: Of its head, as ``ray.init`` takes it; None: that of ``RAY_ADDRESS``, one that was
-            started on this machine, or else the cores of this machine.
-
-    Raises:
-        ConnectionError: If there is none.
+    None: that of ``RAY_ADDRESS``, a cluster on this machine, or else the cores of this machine.
     """
     ray.init(address, include_dashboard=False, log_to_driver=False, configure_logging=False)
     try:

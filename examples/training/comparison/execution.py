@@ -48,14 +48,7 @@ def add_options(parser: argparse.ArgumentParser, *, folder: str, what: str) -> N
 
 
 class Running:
-    """A run in progress: its commands one after another, with a line on the screen.
-
-    Args:
-        job: The run.
-        commands: Commands that train the run, unless that is done, and evaluate it.
-        worker: Worker that runs the commands.
-        position: Line on the screen.
-    """
+    """A run in progress: its commands one after another, with a line on the screen."""
 
     def __init__(self, job: Job, commands: Commands, *, worker: Worker, position: int) -> None:
         self.job, self.worker, self._commands = job, worker, commands
@@ -84,13 +77,7 @@ class Running:
 
 
 class Work(ABC, Generic[Item]):
-    """Items that workers make by runs, each worker one run after another.
-
-    Args:
-        waiting: Items to begin or to resume.
-        workers: The workers.
-        bar: Bar of all items.
-    """
+    """Items that workers make by runs, each worker one run after another."""
 
     def __init__(self, waiting: list[Item], workers: Sequence[Worker], bar: tqdm[Any]) -> None:
         self.waiting, self.workers, self.bar = waiting, workers, bar
@@ -186,15 +173,7 @@ class Work(ABC, Generic[Item]):
 
 
 class Runs(Work[Job]):
-    """The runs of a comparison that are not done.
-
-    Args:
-        waiting: The runs.
-        overrides: Settings of all of them.
-        wanted: Evaluation of their policies.
-        anew: Runs to train again from the start.
-        workers: The workers.
-    """
+    """The runs of a comparison that are not done; runs ``anew`` are trained from the start."""
 
     def __init__(
         self,
@@ -247,18 +226,8 @@ def make_runs(
 ) -> int:
     """Train and evaluate the runs that are not done, and collect their rows.
 
-    Args:
-        comparison: The runs.
-        most: Runs at a time; None: :data:`JOBS`, or on a cluster as many as there are.
-        ray: Address of a Ray cluster, empty for the present cluster; None: this machine.
-        anew: True to train runs with other settings again.
-
-    Returns:
-        Exit status: 1 if a run failed, 128 and the number of the signal that stopped it.
-
-    Raises:
-        ValueError: If a run was trained with other settings, or Ray cannot be used.
-        FolderInUse: If another process makes runs there.
+    ``most`` runs go at a time, by default :data:`JOBS`, or on a cluster all. The exit status is 1
+    if a run failed, 128 and the number of the signal that stopped it.
     """
     jobs, wanted = comparison.jobs, comparison.evaluation
     with files.lock(comparison.folder):

@@ -32,14 +32,7 @@ Ranges = Mapping[str, BaseDistribution]
 
 
 def fixed_settings(settings: Sequence[str]) -> TrainSettings:
-    """The settings that all trials have, with the defaults of a search.
-
-    Args:
-        settings: As on the command line of ``train.py``.
-
-    Raises:
-        ValueError: If a run cannot have them, or a search cannot go by its evaluations.
-    """
+    """Return the settings of all trials, checked, with the defaults of a search."""
     for text in settings:
         if text.startswith("-") or "=" not in text:
             raise ValueError(f"{text!r} is not NAME=VALUE")
@@ -64,16 +57,9 @@ def fixed_settings(settings: Sequence[str]) -> TrainSettings:
 
 
 def read_ranges(path: Path, settings: Sequence[str]) -> Ranges:
-    """The ranges in a file.
+    """Read ranges from a YAML file, which must be possible with the settings of all trials.
 
-    Args:
-        path: YAML with a line for each setting, ``NAME: {low: 1.0e-4, high: 1.0e-2, log: true}`` or
-            ``NAME: [VALUE, VALUE]``.
-        settings: What all trials have, as on the command line of ``train.py``.
-
-    Raises:
-        ValueError: If there is no such setting, if it is given to all trials, or if a run cannot
-            have a value of its range.
+    A line is ``NAME: {low: 1.0e-4, high: 1.0e-2, log: true}`` or ``NAME: [VALUE, VALUE]``.
     """
     fixed = dict(settings_by_name(fixed_settings(settings)))
     given = {override.key_or_group for override in parse_overrides(settings)}

@@ -92,12 +92,7 @@ class Plan:
 class Trial:
     """The runs of a trial, the same settings with each seed, one after another.
 
-    Args:
-        trial: Optuna's, new or in progress.
-        values: Values of the searched settings.
-        plan: Plan of the search.
-        folder: Folder of the search.
-        reported: Number of evaluations that Optuna has.
+    ``reported`` is the number of evaluations that Optuna has.
     """
 
     def __init__(
@@ -147,15 +142,7 @@ class Trial:
 
 
 class Search(Work[Trial]):
-    """The trials of a search.
-
-    Args:
-        study: Optuna's.
-        plan: Plan of the search.
-        folder: Folder of the trials.
-        trials: Number of trials in all.
-        workers: Workers that make their runs.
-    """
+    """The trials of a search, so many in all."""
 
     def __init__(
         self,
@@ -254,21 +241,10 @@ class Search(Work[Trial]):
 def run_search(
     plan: Plan, folder: Path, *, trials: int, most: int | None = None, ray: str | None = None
 ) -> int:
-    """Make the trials that are missing, and write the results.
+    """Make the missing ones of so many trials, failed and pruned ones included; write the results.
 
-    Args:
-        plan: Plan of the search.
-        folder: Folder of the search, begun or new.
-        trials: Number of trials in all, failed and pruned ones included.
-        most: Trials at a time; None: :data:`JOBS`, or on a cluster as many as there are.
-        ray: Address of a Ray cluster, empty for the present cluster; None: this machine.
-
-    Returns:
-        Exit status: 1 if the last trials failed, 128 and the number of the signal that stopped it.
-
-    Raises:
-        ValueError: If the folder holds another search, or Ray cannot be used.
-        FolderInUse: If another process searches there.
+    ``most`` trials go at a time, by default :data:`JOBS`, or on a cluster all. The exit status is 1
+    if the last trials failed, 128 and the number of the signal that stopped it.
     """
     with _study(plan, folder) as study:
         left = max(trials - sum(t.state.is_finished() for t in study.get_trials(deepcopy=False)), 0)

@@ -18,13 +18,9 @@ _SPECIAL = r"[^\x00-\x7f]|[#!&;<>^`~]"
 
 
 def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
-    """Return the file of settings of a command line, and the settings that it adds.
+    """Return the file of settings of a command line, empty without one, and its settings.
 
-    Returns:
-        The file, empty without one, and its settings but for those that the command line has.
-
-    Raises:
-        ValueError: If it names several files, or one that cannot be read.
+    Settings that the command line has are left out.
     """
     files = [text.removeprefix(_WORD) for text in arguments if text.startswith(_WORD)]
     if len(files) > 1:
@@ -64,11 +60,7 @@ def quoted(text: str) -> str:
 
 
 def read_names(path: Path) -> dict[str, Any]:
-    """Read a YAML file whose keys are the dotted names of settings.
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """Read a YAML file whose keys are the dotted names of settings."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
     try:

@@ -23,11 +23,7 @@ Options of Hydra, as --multirun and --cfg: --hydra-help"""
 
 
 def help_text(usage: str, arguments: Sequence[str] = ()) -> str:
-    """Return usage, the choices of each group, and every setting with its value.
-
-    Raises:
-        ValueError: If there is no such setting or choice.
-    """
+    """Return usage, the choices of each group, and every setting with its value."""
     register()
     given = [text for text in with_lines(arguments) if not text.startswith("-")]
     try:
