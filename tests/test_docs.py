@@ -54,7 +54,7 @@ def entries(nav: object) -> Iterator[str]:
         for each in nav.values():
             yield from entries(each)
     else:
-        for each in nav:  # type: ignore[attr-defined]
+        for each in nav:
             yield from entries(each)
 
 

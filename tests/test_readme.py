@@ -21,13 +21,13 @@ def test_the_first_code_trains_and_prints_three_different_shares(
 ) -> None:
     names: dict[str, object] = {}
     exec(BLOCKS[0], names)
-    assert names["learner"].updates == 40  # type: ignore[attr-defined]
+    assert names["learner"].updates == 40
     printed = ast.literal_eval(capsys.readouterr().out)
     assert {name.split("/")[1] for name in printed} == {"reward", "td_error", "action_gradient"}
     # The entropy weights of the latter two are equal by definition, which looks like a mistake.
     assert len(set(printed.values())) == 3
     assert sum(printed.values()) == pytest.approx(1.0)
-    names["env"].close()  # type: ignore[attr-defined]
+    names["env"].close()
 
 
 def test_the_first_code_has_fifteen_lines_at_most() -> None:

@@ -28,11 +28,7 @@ BLOCKS = (SEEDS[:5], SEEDS[5:])
 
 
 def comparisons(folder: Path, seeds: Sequence[int] = SEEDS) -> list[Comparison]:
-    """Return the comparisons of which all tables and figures are made.
-
-    Args:
-        folder: Folder of the runs.
-        seeds: Seeds of the runs. An arm with fewer seeds has those of them that are its own.
+    """Return the comparisons of all tables and figures; an arm of few seeds has its own of them.
 
     Examples:
         >>> [len(each.jobs) for each in comparisons(Path("runs/paper"))]

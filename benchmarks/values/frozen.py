@@ -107,11 +107,7 @@ def read_frozen(path: Path) -> FrozenBuffer:
 
 
 def frozen_buffers(folder: Path = FOLDER) -> list[FrozenBuffer]:
-    """The buffers of a folder, by name.
-
-    Raises:
-        FileNotFoundError: If there is none.
-    """
+    """Return the buffers of a folder by name, and raise without any."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise FileNotFoundError(f"no frozen buffers in {folder}: `capture` makes them")

@@ -95,10 +95,7 @@ class SampleCounts:
 class FrozenPolicyLearner:
     """A learner whose critics learn the values of a policy that does not change.
 
-    Args:
-        learner: With networks from scratch.
-        policy: Weights of its actor, from now on.
-        signals: What is written in a batch, by name, before the critics learn from it.
+    Each of ``signals`` writes an entry of a batch before the critics learn from the batch.
     """
 
     def __init__(

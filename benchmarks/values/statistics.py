@@ -16,17 +16,10 @@ RANKS = ("rank", "returns_rank")
 
 
 def paired(rows: pd.DataFrame, column: str, *, against: str, at: int | None = None) -> pd.DataFrame:
-    """Differences of every method to one of them.
+    """Subtract a method from each, by the column of a measure, in :data:`ERRORS` its logarithm.
 
-    Args:
-        rows: Measures of trainings.
-        column: The measure: of those in :data:`ERRORS` the logarithms are subtracted.
-        against: The method that is subtracted.
-        at: Updates; None: the mean over all marks.
-
-    Returns:
-        A column for each method; a row for each buffer, the mean over its seeds, or where there are
-        fewer than three buffers for each training. NaN where one of the two is missing.
+    A row is a buffer, the mean over its seeds, or with fewer than three buffers a training: of so
+    many updates, or the mean over all marks. NaN where the other method has none.
     """
     chosen = rows if at is None else rows[rows["updates"] == at]
     index = ["buffer", "seed", "updates"]

@@ -314,6 +314,6 @@ def test_rooms_beyond_the_bounds_of_observations_are_rejected() -> None:
 
 
 def test_the_error_names_a_generator_that_returns_no_world() -> None:
-    register_generator("nothing", lambda source, difficulty: None)  # type: ignore[arg-type, return-value]
+    register_generator("nothing", lambda source, difficulty: None)
     with pytest.raises(TypeError, match="generator 'nothing' must give a World, got NoneType"):
         generate_world("nothing", 0)

@@ -47,7 +47,7 @@ def test_a_field_of_view_of_360_degrees_sees_behind() -> None:
     ids=lambda shapes: next(iter(shapes)),
 )
 def test_a_ray_along_an_edge_meets_its_corner(shapes: dict[str, tuple[object, ...]]) -> None:
-    world = World(name="edge", **shapes)  # type: ignore[arg-type]
+    world = World(name="edge", **shapes)
     with np.errstate(all="raise", under="ignore"):
         ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)
     assert ranges == pytest.approx(1.0)

@@ -39,7 +39,7 @@ def test_a_walker_keeps_off_each_kind_of_obstacle(shapes: dict[str, tuple[object
     far = (-4.0, -4.0, 0.0, 0.0, 0.0)
     free = chosen(World(name="free", walkers=(AVOIDER,)), (0.1, 0.0), far)
     np.testing.assert_allclose(free, np.array([2.9, 1.5]) / math.hypot(2.9, 1.5), atol=1e-5)
-    world = World(name="full", walkers=(AVOIDER,), **shapes)  # type: ignore[arg-type]
+    world = World(name="full", walkers=(AVOIDER,), **shapes)
     across, _ = chosen(world, (0.1, 0.0), far)
     # For a second it would not touch what stands 0.15 m from its rim.
     assert across < 0.6 * free[0]

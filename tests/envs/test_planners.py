@@ -360,7 +360,7 @@ def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
 
     observations = np.zeros((3, 24), np.float32)
     driver = as_driver(policy)
-    driver.begin(None, 0)  # type: ignore[arg-type]
-    actions = driver.drive(None, np.arange(3), observations)  # type: ignore[arg-type]
+    driver.begin(None, 0)
+    actions = driver.drive(None, np.arange(3), observations)
     assert actions.shape == (3, 2) and seen[0] is observations
     assert as_driver(driver) is driver

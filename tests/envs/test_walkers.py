@@ -282,7 +282,7 @@ def test_results_tell_of_walkers_if_there_are_any() -> None:
     results = evaluate(lambda seen: np.ones(2), ["A", BUSY], episodes=6, **given)
     assert all(found.walker_distance is None for found in results[:6])
     met = results[6:]
-    assert all(found.walker_distance >= found.min_clearance for found in met)  # type: ignore
+    assert all(found.walker_distance >= found.min_clearance for found in met)
     summary = summarize(results)
     times = [found.time_to_collision for found in met]
     assert summary["time_to_collision"].value == pytest.approx(np.mean(times))

@@ -67,7 +67,7 @@ def test_pictures_a_second_are_those_of_real_time() -> None:
     robots = VectorNavigationEnv(1, physics="kinematic", action_repeat=1)
     assert robots.metadata["render_fps"] == 10
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
-        VectorNavigationEnv(1, physics="kinematic", render_mode="human")  # type: ignore[arg-type]
+        VectorNavigationEnv(1, physics="kinematic", render_mode="human")
 
 
 def test_the_window_waits_until_a_picture_is_due() -> None:

@@ -65,13 +65,13 @@ def test_who_is_first_at_the_goal_wins(
     keys: list[str], rival: tuple[float, float], winner: str
 ) -> None:
     window = Script(*keys)
-    assert play.race(constant(*rival), straight_task(), window) == winner  # type: ignore[arg-type]
+    assert play.race(constant(*rival), straight_task(), window) == winner
     assert len(window.pictures) > 5
 
 
 def test_both_robots_are_drawn() -> None:
     window = Script("left")
-    play.race(constant(1.0, 1.0), straight_task(), window)  # type: ignore[arg-type]
+    play.race(constant(1.0, 1.0), straight_task(), window)
     last = window.pictures[-1].reshape(-1, 3)
     for color in (ROBOT, RIVAL):
         assert (last == color[:3]).all(1).sum() > 100

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 def make_robots(count: int = 2, **arguments: object) -> stable_baselines.Robots:
     options = {"physics": "kinematic", "world": "B", "max_steps": 6, **arguments}
     mode = AutoresetMode.SAME_STEP
-    return stable_baselines.Robots(VectorNavigationEnv(count, autoreset_mode=mode, **options))  # type: ignore[arg-type]
+    return stable_baselines.Robots(VectorNavigationEnv(count, autoreset_mode=mode, **options))
 
 
 def test_the_last_observation_of_an_episode_is_told_and_a_timeout_is_one() -> None:
@@ -64,7 +64,7 @@ def test_the_policy_acts_as_the_model_does(algorithm: str) -> None:
     model = stable_baselines.make_model(algorithm, robots, learning_starts=0, seed=0)
     model.learn(30)
     seen = robots.reset()
-    want, _ = model.predict(seen, deterministic=True)  # type: ignore[arg-type]
+    want, _ = model.predict(seen, deterministic=True)
     found = stable_baselines.policy_of(model, card={})(seen)
     np.testing.assert_allclose(found, want, atol=1e-5)
     robots.close()

@@ -208,7 +208,7 @@ def test_fusion_adjustments_and_signals_are_configurations_of_their_own() -> Non
 def test_every_argument_is_a_field_with_the_same_default(
     config: type, made: type, left_out: set[str]
 ) -> None:
-    function = made.__init__ if inspect.isclass(made) else made  # type: ignore[misc]
+    function = made.__init__ if inspect.isclass(made) else made
     arguments = {
         name: parameter
         for name, parameter in inspect.signature(function).parameters.items()
@@ -247,7 +247,7 @@ def test_every_option_of_a_loss_is_a_field_and_the_other_way_around(
 ) -> None:
     defaults: dict[str, object] = {"gamma": 0.99, "loss_function": "l2"}
     for made in (ours, SignalLoss, theirs):
-        for name, parameter in inspect.signature(made.__init__).parameters.items():  # type: ignore[misc]
+        for name, parameter in inspect.signature(made.__init__).parameters.items():
             if name not in {"self", "args", "kwargs", "critic_network"}:
                 defaults.setdefault(name, parameter.default)
     left_out = NOT_OF_A_LOSS - ({"value_network", "delay_value"} if theirs is DDPGLoss else set())

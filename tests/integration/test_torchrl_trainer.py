@@ -148,7 +148,7 @@ def test_the_values_for_the_log_keep_no_graph() -> None:
         seen.append(step(trainer, batch))
         return seen[-1]
 
-    stepper.step = remember  # type: ignore[method-assign]
+    stepper.step = remember
     stepper.register(trainer)
     trainer.train()
     assert not any(value.requires_grad for value in seen[0].values())
@@ -156,7 +156,7 @@ def test_the_values_for_the_log_keep_no_graph() -> None:
 
 def test_a_stepper_that_cannot_be_wrapped_raises() -> None:
     with pytest.raises(TypeError, match="stepper must be an OptimizationStepper, got str"):
-        PriorityStepper("step")  # type: ignore[arg-type]
+        PriorityStepper("step")
     with pytest.raises(ValueError, match="must not update priorities itself, got PriorityStepper"):
         PriorityStepper(PriorityStepper())
     with pytest.raises(ValueError, match="got Forgetful"):

@@ -92,7 +92,7 @@ class Look(Hook):
     """Calls a function after each iteration."""
 
     def __init__(self, look: Callable[[TrainingRun], object]) -> None:
-        self.on_iteration = look  # type: ignore[assignment, method-assign]
+        self.on_iteration = look
 
 
 def train(

@@ -224,7 +224,7 @@ def test_a_late_scan_enters_the_map_where_it_was_taken(late: float) -> None:
         entered.append((x, pose[1] + points.ranges[nearest] * math.sin(angles[nearest])))
         return sense(pose, goal, points)
 
-    pilot._map.sense = noting  # type: ignore[method-assign]
+    pilot._map.sense = noting
     controller = Controller(pilot)
     controller.aim((9.0, 0.0))
     # It turns to the left at 2 rad/s, over the direction in which headings begin again.

@@ -281,7 +281,7 @@ def test_a_failing_policy_stops_it_and_is_reported_once(result: Any, reason: str
         orders.extend([] if order is None else [order])
         return order
 
-    loop.controller.tick = noting  # type: ignore[method-assign]
+    loop.controller.tick = noting
     loop.run(5.0)
     assert loop.stands and loop.controller.pilot.goal is None
     assert [order.reason.startswith(reason) for order in orders].count(True) == 1

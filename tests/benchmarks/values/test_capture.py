@@ -42,12 +42,12 @@ def test_returns_are_discounted_and_end_with_the_episode(monkeypatch: pytest.Mon
     def policy(state: TensorDict) -> TensorDict:
         return state.set("action", state["observation"].clone())
 
-    found = capture.monte_carlo(Countdown(), policy, gamma=GAMMA, seed=0)  # type: ignore[arg-type]
+    found = capture.monte_carlo(Countdown(), policy, gamma=GAMMA, seed=0)
     # Of the second robot nothing is known beyond the time limit, when half is still to come.
     assert found["value"].tolist() == [1.0, 2.0, 4.0, 8.0] * 3
     assert found["observation"].equal(found["action"])
     monkeypatch.setattr(capture, "_CUT", 0.2)
-    found = capture.monte_carlo(Countdown(), policy, gamma=GAMMA, seed=0)  # type: ignore[arg-type]
+    found = capture.monte_carlo(Countdown(), policy, gamma=GAMMA, seed=0)
     assert found["value"].tolist() == [1.0, 1.875, 2.0, 1.75, 4.0, 8.0] * 3
 
 

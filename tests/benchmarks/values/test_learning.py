@@ -38,7 +38,7 @@ def test_a_critic_that_gets_other_rewards_does_not(walk: FrozenBuffer) -> None:
 
 
 @pytest.mark.parametrize("marks", [(3,), (0,), (4, 2), ()])
-def test_marks_that_no_update_reaches_are_rejected(marks, walk: FrozenBuffer) -> None:  # type: ignore[no-untyped-def]
+def test_marks_that_no_update_reaches_are_rejected(marks, walk: FrozenBuffer) -> None:
     with pytest.raises(ValueError, match="marks must be even numbers of updates that rise"):
         next(learn(walk, "per", 0, marks=marks))
 
@@ -47,7 +47,7 @@ def test_the_policy_stays_as_it_was_frozen(walk: FrozenBuffer) -> None:
     learner = make_frozen_learner(walk, METHODS["la3p"], 0)
     action = learner.policy(walk.rows[:16].clone())["action"]
     for trains in ("both", "critic", "actor"):
-        learner.update(SampledBatch(walk.rows[:64].clone(), trains=trains))  # type: ignore[arg-type]
+        learner.update(SampledBatch(walk.rows[:64].clone(), trains=trains))
     assert learner.policy(walk.rows[:16].clone())["action"].equal(action)
     other = make_frozen_learner(walk, METHODS["per"], 7)
     assert other.policy(walk.rows[:16].clone())["action"].equal(action)
@@ -67,7 +67,7 @@ def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: Froz
 
 def test_a_signal_of_ones_own_decides_what_is_sampled(walk: FrozenBuffer) -> None:
     def last_cell(learner: object, batch: object) -> torch.Tensor:
-        return (batch["observation"][:, -2] > 0).float()  # type: ignore[index]
+        return (batch["observation"][:, -2] > 0).float()
 
     settings = replace(METHODS["per"], name="last", signals=["last"], eps=1e-4, alpha=1.0)
     (found,) = learn(walk, settings, 0, signals={"last": last_cell}, marks=(60,))
@@ -79,7 +79,7 @@ def test_a_signal_of_ones_own_decides_what_is_sampled(walk: FrozenBuffer) -> Non
 def test_a_replay_of_ones_own_is_used_as_it_is(walk: FrozenBuffer) -> None:
     asked = []
 
-    def mine(buffer: FrozenBuffer, generator: torch.Generator):  # type: ignore[no-untyped-def]
+    def mine(buffer: FrozenBuffer, generator: torch.Generator):
         asked.append(buffer.name)
         return make_replay("rank_per", capacity=len(buffer), batch_size=64, generator=generator)
 

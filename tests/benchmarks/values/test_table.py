@@ -58,8 +58,8 @@ def test_with_one_buffer_the_unit_is_the_training() -> None:
     assert found["rmse_p"].tolist() == [2 / 2**6]
 
 
-def test_methods_are_compared_on_a_buffer(walk: FrozenBuffer, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    def shortly(*arguments, **options):  # type: ignore[no-untyped-def]
+def test_methods_are_compared_on_a_buffer(walk: FrozenBuffer, monkeypatch) -> None:
+    def shortly(*arguments, **options):
         return learn(*arguments, **options, marks=(4, 8))
 
     monkeypatch.setattr(running, "learn", shortly)
@@ -70,7 +70,7 @@ def test_methods_are_compared_on_a_buffer(walk: FrozenBuffer, monkeypatch) -> No
         compare(["uniform"], [walk])
 
 
-def test_the_ten_lines_of_the_page_compare_a_signal_of_ones_own(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_the_ten_lines_of_the_page_compare_a_signal_of_ones_own(monkeypatch, capsys) -> None:
     monkeypatch.setattr(running, "learn", partial(learn, marks=(4, 8)))
     text = (FOLDER.parents[1] / "values.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
@@ -114,7 +114,7 @@ class Here:
     def __exit__(self, *error: object) -> None:
         pass
 
-    def submit(self, function, *arguments):  # type: ignore[no-untyped-def]
+    def submit(self, function, *arguments):
         from concurrent.futures import Future
 
         future: Future[object] = Future()
@@ -130,7 +130,7 @@ class Here:
         (["report", "--folder", "{}"], "no frozen buffers in"),
     ],
 )
-def test_what_cannot_be_made_is_rejected(arguments, message, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_what_cannot_be_made_is_rejected(arguments, message, tmp_path, capsys) -> None:
     with pytest.raises(SystemExit):
         main([each.format(tmp_path) for each in arguments])
     assert message in capsys.readouterr().err

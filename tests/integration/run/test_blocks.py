@@ -15,7 +15,7 @@ def test_updates_come_in_blocks_and_are_as_many_as_without(tmp_path: Path) -> No
         train(
             tmp_path / str(block),
             blocky(block),
-            lambda run, found=found: found.update({run.actions: run.updates}),  # type: ignore[misc]
+            lambda run, found=found: found.update({run.actions: run.updates}),
         )
     for actions, updates in blocks.items():
         last = actions // 30 * 30

@@ -180,7 +180,7 @@ def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Pat
     def fail() -> None:
         raise RuntimeError("out of memory")
 
-    failing._evaluate = fail  # type: ignore[method-assign]
+    failing._evaluate = fail
     with pytest.raises(RuntimeError, match="out of memory"):
         failing.train()
     failing.close()
@@ -276,9 +276,9 @@ def test_an_update_that_raises_leaves_a_checkpoint_that_goes_on(tmp_path: Path) 
         count += 1
         if count == 15:
             raise ValueError("the loss is not finite")
-        return update(draw)  # type: ignore[arg-type]
+        return update(draw)
 
-    failing.learner.update = fail  # type: ignore[assignment, method-assign]
+    failing.learner.update = fail
     with pytest.raises(ValueError, match="not finite"):
         failing.train()
     failing.close()
@@ -371,6 +371,6 @@ def test_the_log_has_what_critic_and_actor_gave_whoever_learned_last(
 
 def test_klper_is_told_the_noise_of_the_episode_that_acts(tmp_path: Path) -> None:
     run = TrainingRun(tiny("klper"), tmp_path)
-    run.explorer.shares.fill_(0.25)  # type: ignore[attr-defined]
+    run.explorer.shares.fill_(0.25)
     assert run.explorer.sigma == pytest.approx(0.25 * run.settings.exploration.sigma)
     run.close()

@@ -64,8 +64,8 @@ def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
         learned.update(dict.fromkeys(slots, updates))
         return prepared(draw)
 
-    run.buffer.extend = extended  # type: ignore[method-assign]
-    run._prepared = sees  # type: ignore[method-assign]
+    run.buffer.extend = extended
+    run._prepared = sees
     run.train()
     run.close()
     found = of_run(tmp_path)
