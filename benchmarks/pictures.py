@@ -191,7 +191,7 @@ def histograms(run: Run, output: Path) -> None:
 
 def curves(output: Path) -> None:
     """Greedy success of three methods while they learn, of the rows that are kept."""
-    names = {"uniform": "uniform replay", "per": "PER", "mpfa_per": "MPFA-PER"}
+    names = {"mpfa_per": "MPFA-PER", "per": "PER", "uniform": "uniform replay"}
     figure, axes = new_figure(1, 2, panel=(3.6, 3.0), sharey=True)
     for axis, (table, reward, title) in zip(axes, _LEARNED, strict=True):
         rows = read_table(ROOT / f"docs/results/study/{table}-curves.csv.gz")

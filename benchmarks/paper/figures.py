@@ -20,8 +20,8 @@ _EPISODES = 10
 _BLOCK = 10_000
 """Steps of a point in Fig. 13."""
 _REWARD = f"reward per step, mean of {_EPISODES} episodes"
-_PLACES = {name: place for place, name in enumerate(NAMES.values())}
-"""Number of each method's color, the same in all figures."""
+_METHODS = {name: method for method, name in NAMES.items()}
+"""Method of each of the paper's names, which has its own color."""
 
 
 def plot_figures(rows: Rows, folder: Path) -> list[Path]:
@@ -61,7 +61,7 @@ def plot_rewards_by_map(rows: Rows, methods: Sequence[str], path: Path) -> bool:
     figure, axes = new_figure(2, 2, panel=(5, 3.5), sharey=True)
     for axis, world in zip(axes, MAPS, strict=True):
         runs = {name: rewards(found.values(), world) for name, found in episodes.items()}
-        draw_seeds(axis, runs, places=_PLACES)
+        draw_seeds(axis, runs, methods=_METHODS)
         axis.set(title=f"map {world}", xlabel="episode in this map")
         if axis is not axes[0]:
             axis.get_legend().remove()
@@ -80,7 +80,7 @@ def plot_figure_13(rows: Rows, path: Path) -> bool:
     if not any(runs.values()):
         return False
     figure, (axis,) = new_figure(panel=(8, 5))
-    draw_seeds(axis, runs, places=_PLACES)
+    draw_seeds(axis, runs, methods=_METHODS)
     axis.set(xlabel="step", ylabel=f"total reward of {_BLOCK:,} steps")
     _finish(figure, [axis], path)
     return True

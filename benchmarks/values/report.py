@@ -15,13 +15,21 @@ from benchmarks.values.capture import REWARDS
 from benchmarks.values.frozen import FrozenBuffer
 from benchmarks.values.learning import compared
 from benchmarks.values.statistics import RANKS, differences, paired
-from mpfa_envs.render.charts import finish, look, new_figure
+from mpfa_envs.render.charts import finish, looks, new_figure
 from torchrl_mpfa.saving import write_text_atomically
 from training.comparison.report import table
 from training.statistics import holm, mean_interval
 
-SHOWN = ("uniform", "mpf_per", "mpfa_per", "mpfa_plus", "mixture", "lap")
+SHOWN = ("mpfa_per", AGAINST, "mpfa_plus", "mpf_per", "mixture", "lap", "uniform")
 """Arms whose curves are shown."""
+HEAD = """\
+- **Question.** Which replay learns the values of a fixed policy sooner from a frozen buffer?
+- **Answer.** With sparse rewards, replay by several signals: the reward does it. With a reward for
+  every step no difference to the TD error alone was found. More updates help with both.
+- **How sure.** Five of the six planned differences survive the correction, and their p are final.
+  All others are exploratory.
+- **Changed after the start.** The table ended with five seeds for each buffer instead of ten
+  ([why](../changes.md#what-more-runs-could-not-decide))."""
 _DPI = 160
 
 
@@ -40,22 +48,23 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
     seeds = rows.groupby(["buffer", "method"])["seed"].nunique()
     count = " to ".join(str(number) for number in sorted({seeds.min(), seeds.max()}))
     parts = [
-        "# Table G: which replay learns values sooner?",
+        "# G: Which replay learns values sooner?",
+        HEAD,
         f"{rows['buffer'].nunique()} buffers, {count} seeds in each. "
-        f"Differences to `{AGAINST}`, of the same buffers and seeds, with 95 % intervals over "
-        "buffers; RMSE in per cent of that of PER. [What it is](../../values.md).",
+        f"Differences to `{AGAINST}` are of the same buffers and seeds, with 95 % intervals over "
+        "buffers. RMSE is in per cent of that of PER. [What is measured](../../values.md).",
         "## Planned comparisons",
         planned_table(planned),
         "## All arms",
-        "Means over all marks, the last two columns at the end; `sparse` and `dense` are the RMSE "
-        "to long training in six buffers each. Exploratory but for what was planned, and not "
-        "corrected.",
+        "Numbers are means over all marks, but for those of the last two columns, which are at the "
+        "end. The columns `sparse` and `dense` have the RMSE to long training in six buffers each. "
+        "Arms that were not planned are exploratory and not corrected.",
         arm_table(rows),
-        f"Left out: {'; '.join(f'`{name}`, {why}' for name, why in LEFT_OUT.items())}.",
+        table(("left out", "why"), [[f"`{name}`", why] for name, why in LEFT_OUT.items()]),
         "## Pairs",
-        "Kinds of priorities with about the same effective sample, and what has one thing changed. "
-        "Exploratory, not corrected. `la3p` and `uniform_halves` update the critics twice where "
-        "others do once, on half as many transitions.",
+        "Pairs have about the same effective sample, or one thing changed. They are exploratory "
+        "and not corrected. `la3p` and `uniform_halves` update the critics twice where others do "
+        "once, on half as many transitions.",
         pair_table(rows),
         "## Fading",
         "RMSE to long training after so many updates.",
@@ -69,7 +78,7 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         "![RMSE beside PER over updates](G_curves.png)",
         "![RMSE beside PER of all arms](G_arms.png)",
     ]
-    kept = ("|", "#", "!")
+    kept = ("|", "#", "!", "- ")
     lines = [part if part.startswith(kept) else fill(part, 120) for part in parts]
     return "\n\n".join(lines) + "\n"
 
@@ -193,21 +202,23 @@ def plot_curves(rows: pd.DataFrame, path: Path) -> None:
     """Plot the RMSE relative to PER over updates, means over buffers with 95 % intervals."""
     figure, axes = new_figure(2, 2, panel=(3.8, 2.4), sharex=True, sharey="col")
     marks = sorted(rows["updates"].unique())
-    references = {"rmse": "long training", "returns_rmse": "returns"}
+    references = {"rmse": "against long training", "returns_rmse": "against returns"}
     for axis, (column, reward) in zip(axes, product(references, REWARDS), strict=True):
         found = rows[rows["buffer"].str.startswith(reward)]
         at = [paired(found, column, against=AGAINST, at=mark) for mark in marks]
-        axis.axhline(0.0, color="0.5")
-        for place, arm in enumerate(name for name in SHOWN if name in at[0]):
+        for arm, style in looks(name for name in SHOWN if name in at[0] or name == AGAINST).items():
+            if arm == AGAINST:
+                axis.axhline(0.0, **style, label=arm)
+                continue
             ends = [mean_interval(gaps[arm].dropna().to_numpy()) for gaps in at]
             mean, low, high = 100 * np.expm1([(e.value, e.low, e.high) for e in ends]).T
-            axis.plot(marks, mean, **look(place), label=arm)
-            axis.fill_between(marks, low, high, color=look(place)["color"], alpha=0.12, lw=0)
-        axis.set_title(f"{reward} rewards, by {references[column]}", fontsize="medium")
+            axis.plot(marks, mean, **style, label=arm)
+            axis.fill_between(marks, low, high, color=style["color"], alpha=0.12, lw=0)
+        axis.set_title(f"{reward} rewards, {references[column]}", fontsize="medium")
         axis.set_xscale("log", base=2)
         axis.set_xticks(marks, [str(mark) for mark in marks])
     figure.supxlabel("updates", fontsize="medium")
-    figure.supylabel("RMSE beside PER [%]", fontsize="medium")
+    figure.supylabel("RMSE, minus PER's [%]", fontsize="medium")
     axes[1].legend(fontsize="x-small", frameon=False, ncols=2)
     finish(figure, axes, path, dpi=_DPI)
 
@@ -215,16 +226,17 @@ def plot_curves(rows: pd.DataFrame, path: Path) -> None:
 def plot_arms(rows: pd.DataFrame, path: Path) -> None:
     """Plot RMSE and rank correlation of all arms relative to PER, with 95 % intervals."""
     found = differences(rows, against=AGAINST)[::-1]
-    figure, axes = new_figure(1, 2, panel=(3.8, 0.19 * len(found) + 0.8), sharey=True)
+    figure, axes = new_figure(1, 2, panel=(3.2, 0.17 * len(found) + 0.8), sharey=True)
     heights = np.arange(len(found))
+    colors = [style["color"] for style in looks(found.index).values()]
     for axis, column in zip(axes, ("rmse", "rank"), strict=True):
         scale = 1.0 if column in RANKS else 100.0
         mean, low, high = (
             scale * found[name].to_numpy() for name in (column, f"{column}_low", f"{column}_high")
         )
         axis.axvline(0.0, color="0.5")
-        axis.hlines(heights, low, high, color="C0", alpha=0.6)
-        axis.plot(mean, heights, "o", color="C0", ms=3)
+        axis.hlines(heights, low, high, color=colors, alpha=0.6)
+        axis.scatter(mean, heights, s=9, color=colors)
     axes[0].set_yticks(heights, found.index, fontsize="x-small")
     axes[0].set_ylim(-0.7, len(found) - 0.3)
     axes[0].set_xlabel("RMSE beside PER [%]")

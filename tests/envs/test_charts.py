@@ -9,7 +9,9 @@ from PIL import Image
 from scipy import stats
 
 from mpfa_envs.render import LINES, plot_histograms, plot_seeds
-from mpfa_envs.render.charts import first_step, seed_band
+from mpfa_envs.render.charts import first_step, looks, seed_band
+from mpfa_envs.scene.colors import METHODS as COLORS
+from torchrl_mpfa.methods import ALIASES, METHODS
 
 STEPS = np.arange(0, 101, 10)
 
@@ -94,3 +96,25 @@ def test_a_histogram_is_darkest_where_the_numbers_are(tmp_path: Path) -> None:
     }
     assert corner[True, False] < 90 and corner[False, True] < 90
     assert corner[True, True] > 200 and corner[False, False] > 200
+
+
+def test_a_method_has_its_color_and_another_arm_of_it_another_dash() -> None:
+    names = ["mine", "td3/mpfa_per", "MPFA-PER, weak", "uniform replay", "PER"]
+    styles = looks(names)
+    assert list(styles) == names
+    assert len({tuple(style.values()) for style in styles.values()}) == len(names)
+    assert styles["td3/mpfa_per"]["color"] == styles["MPFA-PER, weak"]["color"]
+    assert styles["td3/mpfa_per"] == looks(["MPFA-PER"])["MPFA-PER"]
+    assert styles["PER"] == looks(["a", "proportional PER"])["proportional PER"]
+    red, green, blue = (styles["uniform replay"]["color"][start : start + 2] for start in (1, 3, 5))
+    assert red == green == blue
+    assert looks(["DDPG + RAdam"], {"DDPG + RAdam": "ddpg_radam"}) != looks(["DDPG + RAdam"])
+
+
+def test_every_replay_method_has_a_look_of_its_own() -> None:
+    named = {name: ALIASES.get(name, name) for name in METHODS}
+    styles = looks(named, named)
+    assert set(named.values()) <= set(COLORS)
+    assert len({tuple(styles[name].values()) for name in named.values()}) == len(
+        set(named.values())
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.scene.colors import LINES, VIRIDIS
+from mpfa_envs.scene.colors import LINES, METHODS, VIRIDIS
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,7 @@ Band = Literal["interval", "runs"]
 """The band around a mean: its 95 % interval for other runs, or each run."""
 
 _LEVEL = 0.95
+_DASHES = ("-", "--", ":", "-.")
 
 
 def plot_seeds(
@@ -39,7 +41,7 @@ def plot_seeds(
 
     The mean goes to the end of the shortest run. On the line of the level, a tick marks the step at
     which a run first reached it, a triangle the median of all runs, if at least half of them did;
-    the legend has its step.
+    the legend has its step. A replay method has its own color, and uniform replay is gray.
 
     Args:
         runs: Curves of the seeds of each method, by name.
@@ -78,17 +80,18 @@ def draw_seeds(
     level: float | None = None,
     band: Band = "interval",
     limits: tuple[float, float] | None = None,
-    places: Mapping[str, int] | None = None,
+    methods: Mapping[str, str] | None = None,
 ) -> None:
-    """Draw what :func:`plot_seeds` plots into axes of matplotlib; ``places`` number the colors."""
+    """Draw what :func:`plot_seeds` plots into axes of matplotlib; ``methods`` give the colors."""
     if not any(runs.values()):
         raise ValueError("runs must hold a curve at least")
     if level is not None:
         axis.axhline(level, color="0.6", lw=0.8, ls=":")
-    for number, (name, curves) in enumerate(runs.items()):
+    styles = looks(runs, methods)
+    for name, curves in runs.items():
         if not curves:
             continue
-        style = look(number if places is None else places[name])
+        style = styles[name]
         steps, mean, low, high = seed_band(curves)
         if limits is not None:
             low, high = low.clip(*limits), high.clip(*limits)
@@ -262,8 +265,37 @@ def finish(
 
 def look(place: int) -> dict[str, str]:
     """Color of the line of a number, and another dash once all colors are taken."""
-    color = "#" + "".join(f"{channel:02x}" for channel in LINES[place % len(LINES)])
-    return {"color": color, "linestyle": ("-", "--", ":", "-.")[place // len(LINES) % 4]}
+    return _style(LINES[place % len(LINES)], _DASHES[place // len(LINES) % len(_DASHES)])
+
+
+def looks(
+    names: Iterable[str], methods: Mapping[str, str] | None = None
+) -> dict[str, dict[str, str]]:
+    """Color and dash of each name: those of its replay method, or else the next that are free.
+
+    A second arm of a method has the color of the method and another dash.
+    """
+    every, styles = list(names), dict[str, dict[str, str]]()
+    known = methods or {name: method for name in every if (method := _method_in(name))}
+    free = [look(place) for place in range(len(LINES) * len(_DASHES))]
+    # The looks of methods come before those that others may have.
+    first = {known[name]: name for name in reversed(every) if name in known}
+    for name in sorted(every, key=lambda name: (name not in known, name not in first.values())):
+        own = [METHODS[known[name]]] if name in known else []
+        options = [_style(color, dash) for color, dash in own]
+        options += [_style(color, dash) for color, _ in own for dash in _DASHES] or free
+        styles[name] = next((each for each in options if each not in styles.values()), options[0])
+    return {name: styles[name] for name in every}
+
+
+def _method_in(name: str) -> str:
+    """The replay method in a name such as "td3/per" or "MPFA-PER, weak"; empty if there is none."""
+    parts = re.split(r"[/\s,:(]+", name.lower().replace("-", "_"))
+    return next((part for part in reversed(parts) if part in METHODS), "")
+
+
+def _style(color: tuple[int, int, int], dash: str) -> dict[str, str]:
+    return {"color": "#" + "".join(f"{channel:02x}" for channel in color), "linestyle": dash}
 
 
 def _thousands(value: float, _: object) -> str:

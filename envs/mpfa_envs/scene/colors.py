@@ -24,6 +24,38 @@ PURPLE: Final = (204, 121, 167)
 
 LINES: Final = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK)
 """Colors of lines, in order; yellow is too pale on white."""
+GRAY: Final = (140, 140, 140)
+METHODS: Final = {
+    "mpfa_per": (BLUE, "-"),
+    "mpfa_adaptive": (BLUE, "-."),
+    "per": (ORANGE, "-"),
+    "rank_per": (ORANGE, "--"),
+    "uper": (ORANGE, "-."),
+    "mpfa_plus": (GREEN, "-"),
+    "td_reward": (GREEN, "--"),
+    "raise": (GREEN, ":"),
+    "averaged_ddpg": (GREEN, "-."),
+    "mpf_per": (VERMILION, "-"),
+    "ref_er": (VERMILION, "--"),
+    "hvper": (VERMILION, ":"),
+    "rud": (VERMILION, "-."),
+    "her": (PURPLE, "-"),
+    "td_loss": (PURPLE, "--"),
+    "decay": (PURPLE, ":"),
+    "mw": (PURPLE, "-."),
+    "lap": (SKY, "-"),
+    "pal": (SKY, "--"),
+    "klper": (SKY, ":"),
+    "geometric": (SKY, "-."),
+    "la3p": (BLACK, "-"),
+    "reaper": (BLACK, "--"),
+    "ddpg_radam": (BLACK, ":"),
+    "uniform": (GRAY, "-"),
+    "ddpg": (GRAY, "-"),
+    "uniform_halves": (GRAY, "--"),
+    "cer": (GRAY, ":"),
+}
+"""Color and dash of each replay method, the same in every picture."""
 
 PAPER: Final = (255, 255, 255, 255)
 FLOOR: Final = (250, 249, 246, 255)
