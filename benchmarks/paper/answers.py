@@ -1,9 +1,10 @@
-"""Sentences that a reader can quote: what the runs say of the paper's claims."""
+"""What the runs say of the paper's claims: sentences that a reader can quote, and their numbers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,58 +19,74 @@ Found = Mapping[str, pd.DataFrame]
 """Measures of each run, by arm."""
 
 
-def answers(rows: Rows, found: Found) -> list[str]:
+class Answer(NamedTuple):
+    """What the runs say of a claim."""
+
+    said: str
+    """In words."""
+    numbers: list[tuple[str, str, str]]
+    """Claims, what the paper has, and what the runs have."""
+
+
+def answers(rows: Rows, found: Found) -> list[Answer]:
     """Return an answer to each question that has its runs."""
     made = (order(found), against_per(found), training_time(rows), spread(found))
     return [answer for answer in made if answer]
 
 
-def order(found: Found) -> str:
+def order(found: Found) -> Answer | None:
     """Say whether the paper's order of the methods is ours, too."""
     taus = []
     for number, paper in ((2, TABLE_2), (4, TABLE_4)):
         names = in_order(paper)
         if any(f"ddpg-{name}" not in found for name in names):
-            return ""
+            return None
         ours = [found[f"ddpg-{name}"]["success"].mean() for name in names]
         tau = stats.kendalltau([paper[name].success for name in names], ours).statistic
-        taus.append(f"{tau:+.2f} in Table {number}")
+        taus.append((f"Kendall's rank correlation of success, Table {number}", "", f"{tau:+.2f}"))
     made = [difference(found, f"ddpg-{a}", f"ddpg-{b}") for a, b in neighbors()]
     corrected = holm(np.array([1.0 if each is None else each.p for each in made]))
     seen = [
         each is not None and each.gap.value > 0 and p < 0.05
         for each, p in zip(made, corrected, strict=True)
     ]
-    return (
-        f"The paper's order of the methods is {'' if all(seen) else 'not '}confirmed. "
-        f"Of {len(seen)} pairs of neighbors in this order {sum(seen)} differ as in the paper. "
-        f"Kendall's rank correlation between the paper's success and ours is {' and '.join(taus)}."
-    )
+    pairs = "neighbors in the paper's order that differ as in the paper", "", _of(sum(seen), seen)
+    said = f"The paper's order of the methods is {'' if all(seen) else 'not '}confirmed."
+    return Answer(said, [pairs, *taus])
 
 
-def against_per(found: Found) -> str:
+def against_per(found: Found) -> Answer | None:
     """Say whether MPFA-PER reaches more goals than PER, and which differences are excluded."""
     made = difference(found, "ddpg-mpfa_per", "ddpg-per")
     if made is None:
-        return ""
+        return None
     ours, theirs = (found[f"ddpg-{name}"]["success"].mean() for name in ("mpfa_per", "per"))
     value, low, high = (100 * each for each in (made.gap.value, made.gap.low, made.gap.high))
-    published = 100 * (TABLE_2["mpfa_per"].success - TABLE_2["per"].success)
+    claimed = [TABLE_2[name].success for name in ("mpfa_per", "per")]
+    published = 100 * (claimed[0] - claimed[1])
     better = "is better" if low > 0 else "is worse" if high < 0 else "was not seen to be better"
-    text = (
-        f"MPFA-PER {better} than PER: {ours:.1%} of the goals and {theirs:.1%}. "
-        f"The difference is {value:+.1f} points, 95 % [{low:+.1f}, {high:+.1f}], p = {made.p:.3f}. "
-        f"The paper's {published:+.0f} points are "
-        f"{'inside the interval' if low <= published <= high else 'excluded'}."
-    )
+    where = "inside the interval" if low <= published <= high else "excluded"
+    said = f"MPFA-PER {better} than PER, and the paper's difference is {where}."
+    numbers = [
+        (
+            "success of MPFA-PER and of PER",
+            " and ".join(f"{each:.1%}" for each in claimed),
+            f"{ours:.1%} and {theirs:.1%}",
+        ),
+        (
+            "MPFA-PER − PER [points], 95 %, p",
+            f"{published:+.1f}",
+            f"{value:+.1f} [{low:+.1f}, {high:+.1f}], p = {made.p:.3f}",
+        ),
+    ]
     if low <= 0.0 <= high and math.isfinite(made.detectable):
         deviation = made.detectable / detectable(1.0, made.seeds)
         seeds = next(n for n in range(3, 100_000) if detectable(deviation, n) <= 0.01)
-        text += f" A difference of one point would take {seeds} seeds to find with 80 % power."
-    return text
+        numbers.append(("seeds that find one point with 80 % power", "", f"{seeds}"))
+    return Answer(said, numbers)
 
 
-def training_time(rows: Rows) -> str:
+def training_time(rows: Rows) -> Answer | None:
     """Say whether MPFA-PER trains in fewer steps and less time than the methods of Table 3."""
     steps = {
         name: float(np.mean([each["total_steps"].iloc[-1] for each in runs.values()]))
@@ -77,45 +94,50 @@ def training_time(rows: Rows) -> str:
         if (runs := rows.episodes(f"ddpg-{name}"))
     }
     if len(steps) < len(TABLE_3):
-        return ""
-    longer = sum(each > steps["mpfa_per"] for each in steps.values())
-    text = (
-        f"{longer} of the {len(steps) - 1} other methods of Table 3 take more training steps than "
-        "MPFA-PER. In the paper all of them do."
-    )
+        return None
+    others = [name for name in TABLE_3 if name != "mpfa_per"]
+    longer = sum(steps[name] > steps["mpfa_per"] for name in others)
+    most = {0: "the most", len(others): "the fewest"}.get(longer, "neither most nor fewest")
+    said = f"MPFA-PER takes {most} training steps of Table 3, and in the paper the fewest."
+    claim = "methods of Table 3 that take more training steps"
+    numbers = [(claim, _of(len(others), others), _of(longer, others))]
     minutes = rows.times.groupby("arm")["minutes"].mean()
     if len(minutes) == len(TABLE_3):
-        others = minutes.drop("ddpg-mpfa_per")
-        text += (
-            f" Training takes {minutes['ddpg-mpfa_per']:.1f} minutes with MPFA-PER and "
-            f"{others.min():.1f} to {others.max():.1f} with the others."
-        )
-    return text
+        rest = minutes.drop("ddpg-mpfa_per")
+        taken = f"{minutes['ddpg-mpfa_per']:.1f}, {rest.min():.1f} to {rest.max():.1f}"
+        numbers.append(("minutes of training, MPFA-PER and the others", "", taken))
+    return Answer(said, numbers)
 
 
-def spread(found: Found) -> str:
+def spread(found: Found) -> Answer | None:
     """Say how much the success differs by the method, the seed and the learner's additions."""
     runs = [found[f"ddpg-{name}"]["success"] for name in NAMES if f"ddpg-{name}" in found]
     if len(runs) < len(NAMES) or min(map(len, runs)) < 2:
-        return ""
-    means = [each.mean() for each in runs]
+        return None
     deviation = 100 * float(np.sqrt(np.mean([each.var(ddof=1) for each in runs])))
-    text = (
-        f"The thirteen methods reach {min(means):.1%} to {max(means):.1%}. "
-        f"Runs of one method, which differ by their seed alone, vary by {deviation:.1f} points "
-        "(standard deviation)."
-    )
+    published = [row.success for paper in (TABLE_2, TABLE_4) for row in paper.values()]
+    numbers = [
+        ("success of the methods", _ends(published), _ends([each.mean() for each in runs])),
+        ("standard deviation of runs of one method [points]", "", f"{deviation:.1f}"),
+    ]
     arms = [(arm, f"ddpg-{arm.split('-')[1]}") for arm in OTHER_ARMS["letter"].values()]
     both = [
-        [found[arm]["success"].mean() for arm in pair]
+        [float(found[arm]["success"].mean()) for arm in pair]
         for pair in arms
         if all(arm in found for arm in pair)
     ]
     if both:
         letter, ours = zip(*both, strict=True)
-        text += (
-            f" To the letter of the paper its methods reach {min(letter):.1%} to {max(letter):.1%};"
-            f" with the additions that keep DDPG from collapsing they reach {min(ours):.1%} to "
-            f"{max(ours):.1%}."
-        )
-    return text
+        numbers += [
+            ("success of methods to the letter of the paper", "", _ends(letter)),
+            ("success of the same with what keeps DDPG from collapsing", "", _ends(ours)),
+        ]
+    return Answer("", numbers)
+
+
+def _of(count: int, every: Sequence[object]) -> str:
+    return f"{count} of {len(every)}"
+
+
+def _ends(shares: Sequence[float]) -> str:
+    return f"{min(shares):.1%} to {max(shares):.1%}"

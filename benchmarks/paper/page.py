@@ -21,6 +21,7 @@ from benchmarks.paper.tables import (
     unseen_table,
 )
 from torchrl_mpfa.saving import write_text_atomically
+from training.comparison.report import table
 
 COMMIT = "a0a3ab5"
 """Commit that trained and tested every run of the kept rows."""
@@ -34,12 +35,17 @@ _FIGURES = {
     11: "Fig. 11: reward per step with all parts together",
     13: "Fig. 13: total reward of every 10,000 steps",
 }
+_QUESTION = """
+**Question.** Does MPFA-PER reach more goals than other replay methods, and in fewer training steps,
+as the paper's Tables 2 to 4 say?
+"""
 _WORLDS = """
 The paper's worlds are not published. Ours follow its pictures and its text. So compare methods
 within a column, not our column with the paper's.
 """
-_SEEN = """
-What was seen before the end: the rows of the seeds 100 to 104. Nothing was changed after that.
+_CHANGED = """
+**Changed after the start.** Nothing since rows were seen, which were those of the seeds 100 to 104.
+[Two changes](#how-to-read-the-tables) were made before.
 """
 _LETTER = """
 To the letter of the paper (`learner=plain`): without the additions that keep DDPG from collapsing,
@@ -47,17 +53,17 @@ with collisions at 0.35 m from the robot's center, and without mirrored batches.
 """
 _READ = (
     """
-Each number of ours is the mean over runs with Student's 95 % interval over runs. A run is one seed:
-1,000 training episodes in the worlds A to D, then 200 tests of its last policy in an unseen world,
-on simulated wheels. A test ends with a collision at contact. A test that neither succeeds nor
-collides runs out of time, which the paper's tables do not know. The time is that of the tests that
-reached their goal.
+Each number of ours is the mean over runs with Student's 95 % interval over runs. A run is one seed.
+It has 1,000 training episodes in the worlds A to D. Then its last policy has 200 tests in an unseen
+world, on simulated wheels. A test ends with a collision at contact. A test that neither succeeds
+nor collides runs out of time, which the paper's tables do not know. The time is that of the tests
+that reached their goal.
 """,
     """
 Arms with at least six seeds in common are compared seed by seed, and p is that of the permutation
 test of signs. Other arms are compared by the means of all their runs. *Found with 80 % power* is
-the true difference that a t-test of as many seeds finds with a probability of 80 %, at a level of
-5 % divided by the number of comparisons.
+the true difference that a t-test of as many seeds finds with that probability. Its level is 5 %
+divided by the number of comparisons.
 """,
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
@@ -99,16 +105,21 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
     paper = {f"ddpg-{name}": row.success for name, row in {**TABLE_2, **TABLE_4}.items()}
     planned = [(f"ddpg-{a}", f"ddpg-{b}") for a, b in neighbors()]
     missing = missing_runs(rows)
-    provisional = (
-        [f"{len(missing)} of the planned runs are missing, so that every number is provisional."]
+    sure = (
+        f"{len(missing)} of the planned runs are missing, so that every number is provisional."
         if missing
-        else []
+        else "All planned runs are made, and every p is final."
     )
-    said = [*answers(rows, found), *provisional, _WORLDS, _SEEN]
+    made = answers(rows, found)
+    answer = " ".join(each.said for each in made if each.said)
+    head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", _CHANGED]
+    claims = [list(row) for each in made for row in each.numbers]
     return "\n\n".join(
         [
             "# Does the paper's method do what the paper says?",
-            "\n".join(_filled(line, bullet=True) for line in said),
+            "\n".join(_filled(line, bullet=True) for line in head),
+            "## The paper's claims",
+            table(["claim", "paper", "ours"], claims),
             "## Table 2: parts of the method in the unseen world",
             unseen_table(found, TABLE_2),
             "## Table 3: steps and time of the training",
@@ -137,7 +148,7 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_MADE),
             _COMMANDS,
             _KEPT,
-            *([_filled(f"Missing: {spans(missing)}.")] if missing else []),
+            *(["Runs that are missing:", missing_table(missing)] if missing else []),
         ]
     )
 
@@ -161,23 +172,13 @@ def missing_runs(rows: Rows) -> list[str]:
     return [name for name in planned if name not in rows.runs]
 
 
-def spans(runs: Sequence[str]) -> str:
-    """Return names of runs with the seeds of an arm together.
-
-    Examples:
-        >>> spans(["ddpg-per-103", "ddpg-per-104", "ddpg-mw-102"])
-        'ddpg-per 103, 104; ddpg-mw 102'
-    """
+def missing_table(runs: Sequence[str]) -> str:
+    """Return a table of runs, a line for each arm."""
     seeds: dict[str, list[str]] = {}
     for run in runs:
         arm, _, seed = run.rpartition("-")
         seeds.setdefault(arm, []).append(seed)
-    return "; ".join(
-        f"{arm} {found[0]} to {found[-1]}"
-        if len(found) > 2 and int(found[-1]) - int(found[0]) == len(found) - 1
-        else f"{arm} {', '.join(found)}"
-        for arm, found in seeds.items()
-    )
+    return table(["arm", "seeds"], [[arm, ", ".join(found)] for arm, found in seeds.items()])
 
 
 def _filled(text: str, *, bullet: bool = False) -> str:

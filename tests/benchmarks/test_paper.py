@@ -15,7 +15,7 @@ from scipy import stats
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.answers import answers
 from benchmarks.paper.figures import reward_of_blocks, rewards
-from benchmarks.paper.page import missing_runs, spans, write_page
+from benchmarks.paper.page import missing_runs, missing_table, write_page
 from benchmarks.paper.published import NAMES, TABLE_2, TABLE_4, neighbors
 from benchmarks.paper.rows import Rows, keep, keep_time, read_rows
 from benchmarks.paper.runs import comparisons, without
@@ -153,16 +153,9 @@ def test_five_seeds_are_compared_by_their_means(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("gap", "sentences"),
     [
-        (0.05, ["MPFA-PER is better than PER", "The paper's +5 points are inside"]),
-        (
-            0.0,
-            [
-                "MPFA-PER was not seen to be better",
-                "points are excluded",
-                "of one point would take",
-            ],
-        ),
-        (-0.05, ["MPFA-PER is worse than PER", "points are excluded"]),
+        (0.05, ["MPFA-PER is better than PER", "paper's difference is inside the interval"]),
+        (0.0, ["MPFA-PER was not seen to be better", "difference is excluded", "find one point"]),
+        (-0.05, ["MPFA-PER is worse than PER", "difference is excluded"]),
     ],
 )
 def test_answers_say_which_differences_the_runs_exclude(
@@ -172,10 +165,11 @@ def test_answers_say_which_differences_the_runs_exclude(
     arms = {f"ddpg-{name}": [0.85] * 10 for name in NAMES}
     arms["ddpg-mpfa_per"] = [0.85 + gap + each for each in noise]
     rows = made_up(tmp_path, arms)
-    text = " ".join(answers(rows, measures(rows)))
+    made = answers(rows, measures(rows))
+    text = str(made)
     for sentence in sentences:
         assert sentence in text
-    assert "0 of the 5 other methods of Table 3 take more training steps" in text
+    assert "('methods of Table 3 that take more training steps', '5 of 5', '0 of 5')" in text
     assert "The paper's order of the methods is not confirmed." in text
 
 
@@ -185,8 +179,9 @@ def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
     noise = np.resize([0.01, -0.01], 10)
     arms = {f"ddpg-{name}": list(0.3 + 0.05 * i + noise) for i, name in enumerate(names)}
     rows = made_up(tmp_path, arms)
-    text = " ".join(answers(rows, measures(rows)))
-    assert "The paper's order of the methods is confirmed. Of 11 pairs" in text
+    made = answers(rows, measures(rows))[0]
+    assert made.said == "The paper's order of the methods is confirmed."
+    assert made.numbers[0][2] == "11 of 11"
 
 
 def test_neighbors_follow_success_and_then_time() -> None:
@@ -212,8 +207,11 @@ def test_rewards_are_summed_in_whole_blocks_and_averaged_by_map() -> None:
     assert values.tolist() == [0.5, (0.5 + 2.0) / 2]
 
 
-def test_spans_name_the_seeds_of_an_arm_together() -> None:
-    assert spans(["a-b-1", "a-b-2", "a-b-3", "c-5", "c-7", "c-8"]) == "a-b 1 to 3; c 5, 7, 8"
+def test_missing_seeds_of_an_arm_are_in_a_line_of_their_own() -> None:
+    assert missing_table(["a-b-1", "a-b-2", "c-5"]).splitlines()[2:] == [
+        "| a-b | 1, 2 |",
+        "| c | 5 |",
+    ]
 
 
 def test_page_without_rows_names_the_command_that_makes_them(

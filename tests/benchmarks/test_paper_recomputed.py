@@ -201,8 +201,8 @@ def test_other_settings_are_those_of_the_rows() -> None:
     assert count >= 9
 
 
-def test_sentences_of_the_head_are_those_of_the_rows() -> None:
-    head = " ".join(text_of("# Does").split())
+def test_numbers_beside_the_papers_claims_are_those_of_the_rows() -> None:
+    ours = {claim: number for claim, _, number in section("The paper's claims")}
     of_all = {name: 100 * np.mean([*success(f"ddpg-{m}").values()]) for name, m in METHODS.items()}
     a, b = success("ddpg-mpfa_per"), success("ddpg-per")
     common = sorted(a.keys() & b.keys())
@@ -210,26 +210,29 @@ def test_sentences_of_the_head_are_those_of_the_rows() -> None:
         gap, low, high, p = by_signs([a[seed] - b[seed] for seed in common])
     else:
         gap, low, high, p = by_deals([*a.values()], [*b.values()])
-    assert (
-        f"{of_all['MPFA-PER']:.1f}% of the goals and {of_all['PER']:.1f}%. The difference is "
-        f"{100 * gap:+.1f} points, 95 % [{100 * low:.1f}, {100 * high:+.1f}], p = {p:.3f}" in head
-    )
-    assert f"reach {min(of_all.values()):.1f}% to {max(of_all.values()):.1f}%" in head
+    both = f"{of_all['MPFA-PER']:.1f}% and {of_all['PER']:.1f}%"
+    assert ours["success of MPFA-PER and of PER"] == both
+    interval = f"{100 * gap:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}], p = {p:.3f}"
+    assert ours["MPFA-PER − PER [points], 95 %, p"] == interval
+    ends = f"{min(of_all.values()):.1f}% to {max(of_all.values()):.1f}%"
+    assert ours["success of the methods"] == ends
     spread = np.mean([np.var([*success(f"ddpg-{m}").values()], ddof=1) for m in METHODS.values()])
-    assert f"vary by {100 * math.sqrt(spread):.1f} points (standard deviation)" in head
+    deviation = ours["standard deviation of runs of one method [points]"]
+    assert deviation == f"{100 * math.sqrt(spread):.1f}"
     arms = ("mpfa_per", "per", "uniform")
     for end, words in (
-        ("plain-{}-letter", "To the letter of the paper its methods reach"),
-        ("ddpg-{}", "with the additions that keep DDPG from collapsing they reach"),
+        ("plain-{}-letter", "success of methods to the letter of the paper"),
+        ("ddpg-{}", "success of the same with what keeps DDPG from collapsing"),
     ):
         means = [100 * np.mean([*success(end.format(arm)).values()]) for arm in arms]
-        assert f"{words} {min(means):.1f}% to {max(means):.1f}%" in head
+        assert ours[words] == f"{min(means):.1f}% to {max(means):.1f}%"
     for table in ("Table 2", "Table 4"):
         pairs = [(numbers(cells[3])[0], success(arm_of(cells[0]))) for cells in section(table)]
         tau = stats.kendalltau(
             [published for published, _ in pairs], [np.mean([*s.values()]) for _, s in pairs]
         ).statistic
-        assert f"{tau:+.2f} in {table}" in head
+        assert ours[f"Kendall's rank correlation of success, {table}"] == f"{tau:+.2f}"
     longer = [np.mean(steps(f"ddpg-{METHODS[c[0]]}")) for c in section("Table 3")]
-    *others, ours = longer
-    assert f"{sum(each > ours for each in others)} of the 5 other methods of Table 3" in head
+    *others, own = longer
+    count = sum(each > own for each in others)
+    assert ours["methods of Table 3 that take more training steps"] == f"{count} of 5"

@@ -1,0 +1,55 @@
+"""The study's pictures and pages have the numbers of the kept rows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import study
+from training.records import area_under
+
+STUDY = Path(__file__).resolve().parents[2] / "docs/results/study"
+ROW = re.compile(r"^\| ([\w/-]+) \| (\d+) \| (\d\.\d{3})[ |]", re.MULTILINE)
+"""A row of the table of arms: its name, runs and area."""
+
+
+@pytest.mark.parametrize("table", study.PANELS)
+def test_every_area_of_a_page_is_that_of_the_kept_rows(table: str) -> None:
+    page = (STUDY / f"{table}.md").read_text(encoding="utf-8")
+    areas = {
+        arm: [area_under(*run) for run in runs] for arm, runs in study.read_curves(table).items()
+    }
+    expected = {name: (int(count), area) for name, count, area in ROW.findall(page)}
+    found = {name: (len(areas[arm]), f"{np.mean(areas[arm]):.3f}") for arm, name in short(areas)}
+    assert found == expected
+
+
+def short(arms: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Arms, and their names without the parts that all arms of their table have in common."""
+    parts = {arm: arm.split("/") for arm in arms}
+    for end in (0, -1):
+        while min(map(len, parts.values())) > 1 and len({each[end] for each in parts.values()}) < 2:
+            for each in parts.values():
+                each.pop(end)
+    return ((arm, "/".join(each)) for arm, each in parts.items())
+
+
+@pytest.mark.parametrize("table", study.PANELS)
+def test_the_arms_of_a_panel_have_rows_and_differ(table: str) -> None:
+    curves = study.read_curves(table)
+    for arms in study.PANELS[table].values():
+        assert set(arms.values()) <= set(curves)
+        assert len(set(arms.values())) == len(arms)
+
+
+def test_a_picture_is_made_of_the_kept_rows(tmp_path: Path) -> None:
+    assert study.main(["L", "cliffwalk", "--output", str(tmp_path)]) == 0
+    for kept in (STUDY / "L.png", STUDY.parents[1] / "images/cliffwalk.png"):
+        with Image.open(tmp_path / kept.name) as new, Image.open(kept) as old:
+            assert new.size == old.size
+            assert (np.asarray(new) == np.asarray(old)).mean() > 0.99
