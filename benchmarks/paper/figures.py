@@ -75,7 +75,8 @@ def plot_figure_13(rows: Rows, path: Path) -> bool:
     """Plot Fig. 13, the total reward of every 10,000 steps; return False without runs."""
     runs = {
         NAMES[name]: [reward_of_blocks(each) for each in rows.episodes(f"ddpg-{name}").values()]
-        for name in TABLE_4
+        for name in NAMES
+        if name in TABLE_4
     }
     if not any(runs.values()):
         return False

@@ -72,7 +72,7 @@ CURVES = {
     8: ("per", "td_reward", "td_loss", "mpf_per"),
     9: ("per", "raise"),
     10: ("per", "raise", "decay"),
-    11: ("per", "raise", "decay", "mpf_per", "mpfa_per"),
+    11: ("mpfa_per", "per", "mpf_per", "raise", "decay"),
 }
 """Methods of the figures of reward by map. Figs. 10 and 11: those that the text names."""
 
