@@ -123,10 +123,22 @@ def filmed(policy: Policy) -> tuple[int, WorldTask]:
 def episode(output: Path) -> None:
     """A drive through a maze of the test set to its goal, with lidar, map and trail."""
     policy = load_policy(SHIPPED)
-    number, task = filmed(policy)
+    _write_film(policy, filmed(policy), output / "episode.gif")
+
+
+def navigation(output: Path) -> None:
+    """A drive of the paper's robot in the paper's test world, with lidar and trail."""
+    policy = load_policy("td3-paper")
+    found = longest(drive(policy, [WORLD], episodes=20, **_HOW))
+    _write_film(policy, found, output / "navigation.gif")
+
+
+def _write_film(policy: Policy, found: tuple[int, WorldTask], path: Path) -> None:
+    """Drive a task, by its number and itself, and write the pictures."""
+    number, task = found
     how: dict[str, Any] = {"traces": False, "seed": number, "physics": PHYSICS}
     film = film_episode(policy, task, most=_FRAMES, **how)
-    path, time = output / "episode.gif", film.frame_time
+    time = film.frame_time
     write_animation(film.frames, path, frame_time=time, speed=_SPEED, most=_FRAMES + 1)
 
 
@@ -210,7 +222,7 @@ OF_RUN: dict[str, Callable[[Run, Path], None]] = {
     each.__name__: each for each in (values, samples, histograms)
 }
 OTHERS: dict[str, Callable[[Path], None]] = {
-    each.__name__: each for each in (episode, curves, rooms, methods)
+    each.__name__: each for each in (episode, navigation, curves, rooms, methods)
 }
 
 

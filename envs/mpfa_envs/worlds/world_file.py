@@ -38,7 +38,7 @@ _MOST_CELLS: Final = 100_000
 
 
 def load_world(path: str | os.PathLike[str]) -> World:
-    """Read a world from a YAML file; ``docs/worlds.md`` describes the format.
+    """Read a world from a YAML file; ``docs/howto/world.md`` describes the format.
 
     A YAML file with the key ``image`` is a map of ROS and read as by :meth:`World.from_map`.
 
