@@ -38,9 +38,9 @@ def page() -> str:
         f"{introduction}{START}\n| setting | default | meaning |\n|---|---|---|\n{''.join(_rows())}"
         "\n## Learners\n\n"
         "What `learner=NAME` sets other than `learner=ddpg`; `regime=rooms` wins over it.\n"
-        f"\n| learner | in rooms | in paper | meaning |\n|---|---|---|---|\n{learners}"
-        "\n## Methods\n\nWhat a method has beyond `method=mpfa_per`, or another default.\n"
-        f"\n| setting | default | methods | meaning |\n|---|---|---|---|\n{_method_rows()}"
+        f"\n| learner | settings | meaning |\n|---|---|---|\n{learners}"
+        "\n## Methods\n\nWhat a method has beyond `method=mpfa_per`, or with another default.\n"
+        f"\n| setting | default | meaning, if not above |\n|---|---|---|\n{_method_rows()}"
     )
 
 
@@ -50,8 +50,7 @@ def _rows() -> Iterator[str]:
     values = [_values(regime) for regime in REGIMES]
     for name, meaning in meanings.items():
         rooms, paper = (_shown(each[name]) for each in values)
-        default = rooms if rooms == paper else f"rooms: {rooms}<br>paper: {paper}"
-        yield _row(name, default, meaning)
+        yield _row(name, _of_regimes(rooms, paper), meaning)
         if name == "curriculum.stages":
             for field, of_a_stage in _meanings(Stage, ""):
                 default = _shown(getattr(Stage(), field))
@@ -70,25 +69,39 @@ def _learner_row(learner: str) -> str:
                 if name not in ("learner.name", "learner.algorithm")
             )
         )
-    return (
-        f"| `{learner}` | {' | '.join(changed)} | {_text(GROUPS['learner'][learner].__doc__)} |\n"
+    meaning = _text(GROUPS["learner"][learner].__doc__)
+    return f"| `{learner}` | {_of_regimes(*changed)} | {meaning} |\n"
+
+
+def _of_regimes(rooms: str, paper: str) -> str:
+    """What holds in both regimes, or in each."""
+    if rooms == paper:
+        return rooms
+    return "<br>".join(
+        f"{name}: {value}" for name, value in zip(REGIMES, (rooms, paper), strict=True) if value
     )
 
 
 def _method_rows() -> str:
-    """A row for each setting and default of the methods that ``mpfa_per`` does not have."""
+    """A row for each setting that a method has other than ``mpfa_per``, or with another default."""
     usual = METHODS["mpfa_per"]
-    rows: dict[tuple[str, str, str], list[str]] = {}
+    above = {entry.name for entry in fields(usual)}
+    rows: dict[str, dict[str, list[str]]] = {}
+    own: dict[str, str] = {}
     for method, made in METHODS.items():
         meanings = dict(_meanings(type(made), ""))
         for entry in fields(made):
             value = getattr(made, entry.name)
             if entry.name != "name" and getattr(usual, entry.name, None) != value:
-                row = entry.name, _shown(value), meanings[entry.name]
-                rows.setdefault(row, []).append(f"`{method}`")
+                rows.setdefault(entry.name, {}).setdefault(_shown(value), []).append(f"`{method}`")
+                own[entry.name] = "" if entry.name in above else meanings[entry.name]
     return "".join(
-        _row(f"method.{name}", value, ", ".join(found), meaning)
-        for (name, value, meaning), found in sorted(rows.items())
+        _row(
+            f"method.{name}",
+            "<br>".join(f"{value}: {', '.join(found)}" for value, found in values.items()),
+            own[name],
+        )
+        for name, values in sorted(rows.items())
     )
 
 

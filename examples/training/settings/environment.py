@@ -36,40 +36,36 @@ class EnvironmentSettings:
     max_steps: int = 500
     """Time limit of an episode [0.1 s]."""
     action_repeat: int = 2
-    """Time steps of 0.1 s for which an action is held. With one, rewards are twice as many actions
-    away, and DDPG is less reliable (``docs/tuning.md``)."""
+    """Time steps of 0.1 s for which an action is held. DDPG is less reliable with one
+    (``docs/tuning.md``)."""
     progress_scale: float = setting(5.0, NOT_NEGATIVE)
-    """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
-    far away, and a critic that is a little too smooth would rather circle than arrive."""
+    """eps_p of Eq. 25, not given in the paper. With 15 robots circle near the goal."""
     step_cost: float = setting(0.0, NOT_NEGATIVE)
-    """Cost of a time step of 0.1 s, so that a robot that can stand still does not."""
+    """Cost of a time step of 0.1 s, for robots that can stand still."""
     clearance: float = setting(0.07, NOT_NEGATIVE)
-    """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
-    center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
+    """Clearance below which training counts a collision [m]. With 0.17 m a passage of 0.9 m has
+    0.2 m left to drive in."""
     detour_chance: float = 0.8
-    """Chance that start and goal of an episode must have an obstacle between them. Without, up to a
-    half of the goals can be driven at blindly."""
+    """Chance that a task must have an obstacle between start and goal."""
     progress: str = "straight_line"
-    """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or
-    ``none``, the goal and the collision alone."""
+    """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or ``none``:
+    goal and collision alone."""
     max_goal_distance: float | None = setting(None, POSITIVE)
     """Longest path of a sampled task [m]; null: no limit."""
     episodes_per_world: int = setting(1, at_least(1))
-    """Episodes of a robot in a world of a generator before it gets another one."""
+    """Episodes of a robot in a world of a generator."""
     memory: str = "none"
-    """``map``: the robot maps the hits of its lidar and observes the path to the goal that the map
-    leaves open; ``none``: it observes only the current scan."""
+    """``map``: the robot observes the path to the goal on a map of its lidar's hits; ``none``: the
+    current scan alone."""
     history: int = setting(0, at_least(0))
-    """Earlier scans of the lidar that it observes, which show what moves."""
+    """Earlier scans in the observation, which show what moves."""
     field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))
-    """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own. A robot
-    that must keep moving is run into from behind by people unless it sees all 360."""
+    """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
-    """Share of the robots whose actions pass the filter that keeps them off what their lidar sees
-    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With
-    some, a policy learns from long drives and from collisions; with 1, it needs the filter. DQN and
-    Q learning, which choose among a few actions, have none."""
+    """Share of the robots whose actions pass the filter that keeps them off obstacles
+    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1 a
+    policy needs the filter. DQN and Q learning have none."""
     mirror: bool = True
-    """Show the learner half of what it samples in the mirror: left and right are alike."""
+    """Show the learner half of its samples in the mirror."""

@@ -18,21 +18,21 @@ class LearnerSettings:
     """Part of the run's folder and of its group in wandb."""
     algorithm: str = setting("ddpg", choice("ddpg", "td3", "sac", "dqn", "q_learning"))
     """``ddpg``, ``td3``, ``sac``, ``dqn`` or ``q_learning``; ``learner=td3`` chooses it with what
-    goes with it. The last two choose among seven pairs of wheel speeds."""
+    goes with it."""
     actor_lr: float = setting(1e-4, POSITIVE)
     """Learning rate of the actor at the start; 1e-4 is the paper's (Table 1)."""
     critic_lr: float = setting(1e-4, POSITIVE)
     """Learning rate of the critics at the start; 1e-4 is the paper's (Table 1)."""
     lr_end_factor: float = setting(0.0, SHARE)
-    """Learning rates fall with the episodes to this fraction of the first; 1: constant. At a
-    constant rate DDPG forgets and relearns, and the last policy is a matter of luck."""
+    """Learning rates fall with the episodes to this fraction of the first; 1: constant, by which
+    DDPG forgets and relearns."""
     lr_power: float | None = setting(None, POSITIVE)
-    """Shape of the fall: 1 is linear, right for a thousand episodes; 3 has halved the rates after a
-    fifth of them, right for a hundred. Null: 1 from 500 episodes on, 3 below."""
+    """Shape of the fall: 1 is linear; 3 has halved the rates after a fifth of the episodes. Null: 1
+    from 500 episodes on, 3 below."""
     gamma: float = setting(0.99, SHARE)
     """Discount of the next action's value (Table 1)."""
     tau: float = setting(0.01, ABOVE_ZERO)
-    """Share of a network by which its target moves in an update; 0.01 is the paper's (Table 1)."""
+    """Share by which a target network moves in an update; 0.01 is the paper's (Table 1)."""
     width: int = setting(64, up_to(2**16))
     """Units of a hidden layer."""
     layers: int = setting(2, up_to(100))
@@ -44,17 +44,17 @@ class LearnerSettings:
     final_init: float | None = setting(3e-3, POSITIVE)
     """Last layers start within this, near the middle of the tanh; null: PyTorch's start."""
     critic_weight_decay: float = setting(1e-4, NOT_NEGATIVE)
-    """L2 decay of the critic. The original DDPG's 1e-2 holds Q well below the returns here."""
+    """L2 decay of the critic."""
     reward_scale: float = setting(0.1, POSITIVE)
     """Factor of rewards in the loss, so that Q is of order one."""
     saturation_penalty: float = setting(1.0, NOT_NEGATIVE)
-    """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
+    """Factor of the penalty on actions in the tanh's flat ends."""
     saturation_limit: float = setting(1.5, NOT_NEGATIVE)
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
     compile: bool | str = setting("auto", _COMPILE)
-    """Make one program of an update, which halves its time: ``true``, ``false``, or ``auto``, from
-    10,000 updates on (an episode counts as 100 actions). It needs a C++ compiler and the headers of
-    Python, and twenty seconds at the start, or a few once such a program was made."""
+    """Make one program of an update, which halves its time: ``true``, ``false``, or ``auto``: from
+    10,000 updates on. Needs a C++ compiler, the headers of Python, and some seconds at the
+    start."""
     policy_delay: int = setting(1, at_least(1))
     """DDPG and TD3: updates of the critics for one of the actor and the targets."""
     policy_noise: float = setting(0.0, NOT_NEGATIVE)

@@ -64,8 +64,8 @@ class ExplorationSettings:
     annealing_steps: int = setting(5_000, at_least(1))
     """Steps in which the noise, or the chance, goes from its start to its end."""
     varied: bool = True
-    """True if each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
-    one size the robot is thrown out of every loop, and never learns what a loop is worth."""
+    """True if each episode has a random share of the noise. Noise of one size throws the robot out
+    of every loop."""
 
 
 @dataclass
@@ -73,8 +73,8 @@ class Stage:
     """A number of episodes, or of actions, in one world or in the worlds of a generator."""
 
     world: str = "A"
-    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, the path of a world file, one world of
-    a generator, as ``bars-7``, or a generator, as ``mixed``: a new world in each episode."""
+    """``A`` to ``D``, ``validation``, ``test``, a world file, one world of a generator, as
+    ``bars-7``, or a generator, as ``mixed``: a new world in each episode."""
     episodes: int = 0
     """Episodes; 0: the stage counts actions."""
     actions: int = 0
@@ -95,8 +95,8 @@ class CurriculumSettings:
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
     """The worlds in their order; all of them count episodes, or all of them count actions."""
     carry: bool = True
-    """True if networks and buffer are kept from world to world, false if they start again; learning
-    rates, beta and random steps follow the whole run in either case."""
+    """True if networks and buffer are kept from world to world; learning rates, beta and random
+    steps follow the whole run in either case."""
 
 
 CURRICULA = {
@@ -136,9 +136,8 @@ class EvaluationSettings:
     every: int = setting(0, at_least(0))
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
-    """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
-    which nothing may be chosen, are rejected with ``choose``. ``same``: where the last stage is; of
-    ``mixed``, in ``mazes``, where policies still differ."""
+    """A world, ``mixed:validation``: the validation worlds of a generator, or ``same``: where the
+    last stage is; of ``mixed``, in ``mazes``. Test worlds are rejected with ``choose``."""
     episodes: int = setting(20, at_least(1))
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
@@ -152,9 +151,9 @@ class TrackingSettings:
     mode: str = setting("off", choice("offline", "online", "off"))
     """wandb: ``offline`` (no account), ``online`` or ``off``."""
     csv: bool = False
-    """True if TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
+    """True if TorchRL's CSVLogger writes a file for each number, to ``csv/``."""
     tensorboard: bool = False
-    """True if TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
+    """True if TorchRL's TensorboardLogger writes to ``tensorboard/``."""
     project: str = setting("torchrl-mpfa", WORD)
     """wandb: the project."""
     group: str | None = setting(None, _GROUP)
@@ -162,8 +161,8 @@ class TrackingSettings:
     log_every: int = setting(200, at_least(1))
     """Actions between two entries of losses, weights and priorities."""
     pictures_every: int | None = setting(0, at_least(0))
-    """Actions between two sets of pictures of the policy in the worlds of ``evaluation.world``,
-    for wandb and TensorBoard; 0: at the end alone, null: none."""
+    """Actions between two sets of pictures of the policy, for wandb and TensorBoard; 0: at the end
+    alone, null: none."""
 
 
 @dataclass
@@ -173,13 +172,13 @@ class RaySettings:
     workers: int = setting(0, at_least(0))
     """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
     address: str | None = setting(None, WORD)
-    """Address of a cluster's head; null: that of ``RAY_ADDRESS``, one that was started on this
-    machine, or else the cores of this machine."""
+    """Address of a cluster's head; null: that of ``RAY_ADDRESS``, a cluster on this machine, or
+    else its cores."""
     steps: int = setting(16, at_least(1))
     """Actions of each robot of a worker before it writes them and gets new weights."""
     sync: bool = False
-    """True if the workers wait for each other and for the updates. If not, they drive on while the
-    learner learns, and no two runs are alike."""
+    """True if the workers wait for each other and for the updates; if not, no two runs are
+    alike."""
 
 
 @dataclass
@@ -223,8 +222,8 @@ class TrainSettings:
     device: str = "cpu"
     """Device of the networks; the buffer stays in main memory."""
     threads: int = setting(1, up_to(1024))
-    """Threads of PyTorch, by which the last bits of a network depend; with networks this small a
-    second one gains nothing."""
+    """Threads of PyTorch, on which the last bits of a network depend. Small networks gain nothing
+    by a second."""
     overwrite: bool = False
     """True to start again in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
