@@ -258,6 +258,8 @@ NUMBER = re.compile(r"(?<![A-Za-z])[\d−-]?\d[\d.,]*")
 FEWEST_WORDS = 4
 """Words of the shortest sentence; fewer are a label."""
 RESULTS = ("results.md", "results/", "paper.md", "study.md", "values.md", "cliffwalk.md")
+GUIDES = ("results.md", "results/changes.md", "study.md")
+"""Pages of results that lead to others, or say how they were made."""
 LIMITS = {"readme": (15.0, 0.05, 0.2), "page": (15.0, 0.05, 0.3), "results": (18.0, 0.08, 0.8)}
 """Words a sentence, share of sentences of more than thirty words, numbers a sentence."""
 NOT_YET = [
@@ -312,3 +314,16 @@ def test_sentences_are_short_and_have_few_numbers(page: str) -> None:
     limits = LIMITS["readme" if page == "../README.md" else kind]
     found = measured(text)
     assert all(each <= limit for each, limit in zip(found, limits, strict=True)), (found, limits)
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.startswith(RESULTS) and page not in GUIDES]
+)
+def test_a_page_of_results_begins_with_what_was_found(page: str) -> None:
+    text = (DOCS / page).read_text(encoding="utf-8").split("\n## ")[0]
+    said = re.findall(r"^- \*\*(.+?)\.\*\* ", text, re.MULTILINE)
+    assert said[:4] == ["Question", "Answer", "How sure", "Changed after the start"]
+
+
+def test_the_page_of_results_is_read_once() -> None:
+    assert len((DOCS / "results.md").read_text(encoding="utf-8").split()) <= 1_200
