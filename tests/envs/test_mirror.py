@@ -1,18 +1,118 @@
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from mpfa_envs import WORLDS, Box, Mirror, RandomMirror, World, make_navigation_env
+from mpfa_envs import (
+    WORLDS,
+    Box,
+    Mirror,
+    NavigationEnv,
+    RandomMirror,
+    TaskConfig,
+    World,
+    make_navigation_env,
+)
 from tests.envs.paper import paper_env
 
 
 def mirrored(world: World) -> World:
     boxes = tuple(Box(box.x_min, -box.y_max, box.x_max, -box.y_min) for box in world.boxes)
     return World(name="mirrored", boxes=boxes)
+
+
+ALL_AROUND: dict[str, Any] = {"sectors": 36, "memory": "map", "history": 2}
+"""Observations of a robot that sees all around."""
+
+
+@pytest.mark.parametrize("robot", ["kobuki", "turtlebot4", "burger", "waffle"])
+def test_front_and_rear_are_those_of_a_robot_put_down_the_other_way_round(robot: str) -> None:
+    sides = [Mirror(front_rear=each, **ALL_AROUND) for each in (False, True)]
+
+    def turned(values: np.ndarray, what: str) -> np.ndarray:
+        image = torch.from_numpy(values)
+        for side in sides:
+            image = getattr(side, what)(image)
+        return image.numpy()
+
+    task = {"robot": robot, "physics": "kinematic", "memory": "map", "history": 2}
+    env, other = (NavigationEnv(world="D", **task) for _ in range(2))
+    rng = np.random.default_rng(0)
+    moved = 0.0
+    for _ in range(3):
+        seen, info = env.reset(seed=int(rng.integers(100)))
+        (x, y, heading), goal = env.task
+        image, _ = other.reset(options={"start": (x, y, heading + math.pi), "goal": goal})
+        done = False
+        for _ in range(25):
+            np.testing.assert_allclose(image, turned(seen, "observation"), atol=2e-5)
+            if done:
+                break
+            action = rng.uniform(-1.0, 1.0, 2).astype(np.float32)
+            seen, reward, done, _, info = env.step(action)
+            image, other_reward, other_done, _, _ = other.step(turned(action, "action"))
+            assert other_done == done
+            assert other_reward == pytest.approx(reward, abs=1e-5)
+        moved += info["path_length"]
+    assert moved > 1.0
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("sectors", [6, 36])
+def test_each_mirror_undoes_itself_and_they_commute(sectors: int) -> None:
+    sides = [
+        Mirror(sectors=sectors, memory="map", history=1, front_rear=each) for each in (False, True)
+    ]
+    seen, done = torch.rand(5, 2 * sectors + 9), torch.rand(5, 2)
+    for what, values in (("observation", seen), ("action", done)):
+        left_right, front_rear = (getattr(side, what) for side in sides)
+        for side in (left_right, front_rear):
+            assert side(side(values)).equal(values) and not side(values).equal(values)
+        assert left_right(front_rear(values)).equal(front_rear(left_right(values)))
+
+
+@pytest.mark.parametrize(
+    ("task", "mirrors"),
+    [
+        ({}, 1),
+        ({"lidar": {"sectors": 36, "field_of_view": 360.0}}, 1),
+        ({"robot": "kobuki"}, 2),
+        ({"robot": "kobuki", "lidar": {"sectors": 27, "field_of_view": 270.0}}, 1),
+        ({"robot": "kobuki", "lidar": {"sectors": 35, "field_of_view": 360.0}}, 1),
+    ],
+)
+def test_a_task_has_the_mirrors_of_its_robot_and_lidar(task: dict[str, Any], mirrors: int) -> None:
+    config = TaskConfig(memory="map", **task)
+    transform = config.make_mirror()
+    assert len(transform.mirrors) == mirrors
+    low, _ = config.make_spaces(10.0)
+    for mirror in transform.mirrors:
+        assert mirror.observation(torch.rand(low.shape)).shape == low.shape
+
+
+def test_a_quarter_of_the_transitions_is_seen_in_each_mirror_and_in_both() -> None:
+    torch.manual_seed(0)
+    rows = TensorDict(
+        {
+            "observation": torch.rand(800, 42),
+            "action": torch.rand(800, 2),
+            "next": {"observation": torch.rand(800, 42)},
+        },
+        [800],
+    )
+    shown = RandomMirror(sectors=36, front_rear=True)(rows.clone())
+    left, right = rows["action"].unbind(1)
+    for image in ((left, right), (right, left), (-left, -right), (-right, -left)):
+        chosen = (shown["action"] == torch.stack(image, 1)).all(1)
+        # 800 samples of a quarter: five standard deviations are 61.
+        assert 139 < chosen.sum() < 261
 
 
 def test_the_mirror_shows_the_view_in_the_mirrored_world(physics: str) -> None:

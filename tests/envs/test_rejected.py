@@ -32,6 +32,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.deploy import Pilot
 from mpfa_envs.generators.generate import generator_tasks, split_worlds
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from mpfa_envs.sensing.binning import Binning
@@ -171,6 +172,8 @@ MIRROR: Rows = [
     ({"sectors": -1}, "sectors must be a positive integer, got -1"),
     ({"history": -1}, "history must be an integer of at least 0, got -1"),
     ({"pairs": [(1.0, 1.0), (0.0, 1.0)]}, "pairs must hold the mirror image of each, got none of"),
+    ({"sectors": 35, "front_rear": True}, "sectors must be even with front_rear, got 35"),
+    ({"pairs": WHEEL_PAIRS, "front_rear": True}, "pairs must be None with front_rear, got"),
 ]
 CHANCE: Rows = [
     ({"chance": -0.1}, r"chance must be in \[0, 1\], got -0.1"),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from gymnasium.spaces import Box as BoxSpace
@@ -33,6 +33,10 @@ from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
 from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, payments_of, resolve_reward
 from mpfa_envs.worlds.world import World
+
+if TYPE_CHECKING:
+    from mpfa_envs.robots.discrete import WheelPairs
+    from mpfa_envs.sensing.mirror import RandomMirror
 
 Progress = Literal["straight_line", "shortest_path", "none"]
 """Measure of the reward's progress."""
@@ -242,6 +246,32 @@ class TaskConfig:
             time_step=self.time_step,
             action_repeat=self.action_repeat,
             clearance=clearance,
+        )
+
+    def make_mirror(self, *, pairs: WheelPairs | None = None) -> RandomMirror:
+        """Make the transform that shows a learner half of its transitions in the mirror.
+
+        Front and rear are swapped as well if robot and lidar have them alike: wheels that are as
+        fast backwards, and a whole turn of sectors.
+
+        Args:
+            pairs: As for :class:`~mpfa_envs.Mirror`; with these front and rear stay.
+
+        Raises:
+            ValueError: If a pair has no mirror image among them.
+        """
+        # Most of what a task is for needs no PyTorch.
+        from mpfa_envs.sensing.mirror import RandomMirror
+
+        lidar, robot = self.make_lidar(), self.robot
+        all_around = lidar.field_of_view == 360.0 and lidar.sectors % 2 == 0
+        alike = all_around and robot.min_wheel_speed == -robot.max_wheel_speed
+        return RandomMirror(
+            sectors=lidar.sectors,
+            memory=self.memory,
+            history=self.history,
+            pairs=pairs,
+            front_rear=alike and pairs is None,
         )
 
     def make_noise(self, robots: int) -> NoisyMotion | None:

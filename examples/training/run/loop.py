@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import GoalRelabeling, RandomMirror
+from mpfa_envs import GoalRelabeling
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.methods.her import HindsightGoals
@@ -79,13 +79,7 @@ class TrainingRun:
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
-        robots = vector_of(env)
-        self._task = robots.config
-        self._remembered: dict[str, Any] = {
-            "sectors": robots.lidar.sectors,
-            "memory": robots.config.memory,
-            "history": robots.config.history,
-        }
+        self._task = vector_of(env).config
         capacity, scale = settings.method.capacity, settings.learner.reward_scale
         self.log = UpdateLog(capacity, reward_scale=scale)
         self._build()
@@ -137,7 +131,7 @@ class TrainingRun:
             self.entries += relabel.entries
         if settings.environment.mirror:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
-            self.buffer.append_transform(RandomMirror(**self._remembered, pairs=pairs))
+            self.buffer.append_transform(self._task.make_mirror(pairs=pairs))
 
     def _begin_stage(self, *, again: int = 0) -> None:
         seed = self.settings.seed * 1_000_003 + self.schedule.stage + again
