@@ -15,7 +15,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 from mpfa_envs import Policy, evaluate, export_policy, load_policy, save_policy
 from mpfa_envs.deploy import CardError, Pilot
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.policies.layers import Choice, Linear, ReLU, Scale, Table, Tanh
+from mpfa_envs.policies.layers import Choice, Clip, Linear, ReLU, Scale, Table, Tanh
 from mpfa_envs.policies.policy import PolicyFileError
 from mpfa_envs.sensing.binning import Binning
 from tests.envs.exported import ENV_ARGUMENTS, SHIPPED, exported, make_policy
@@ -60,9 +60,14 @@ def test_scaled_actions_and_choices_are_the_same_too(tmp_path: Path) -> None:
     linear = Linear(weight, np.zeros(3, np.float32))
     pairs = np.array([[-1, 1], [1, 1], [1, -1]], np.float32)
     bounds = Scale(center=np.array([0.5, 0.1], np.float32), half=np.array([0.5, 2], np.float32))
+    clip = Clip(low=np.array([0.2, -1], np.float32), high=np.array([0.6, 0.5], np.float32))
     last = Linear(weight[:2, :3], np.zeros(2, np.float32))
     for number, layers in enumerate(
-        ([linear, Choice(pairs)], [linear, ReLU(), last, Tanh(), bounds])
+        (
+            [linear, Choice(pairs)],
+            [linear, ReLU(), last, Tanh(), bounds],
+            [linear, ReLU(), last, Tanh(), bounds, clip],
+        )
     ):
         policy = Policy(layers)
         found = load_policy(export_policy(policy, tmp_path / f"{number}.onnx"))

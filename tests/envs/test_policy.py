@@ -65,6 +65,29 @@ def test_it_chooses_what_the_network_chooses() -> None:
     assert np.ptp(expected, axis=0).min() > 0.1  # The network does not say the same to all.
 
 
+class Reached(ToBounds):
+    """Bounds that are reached, and clipped, before the tanh has its end."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        ends = self.center - self.half_range, self.center + self.half_range
+        return super().forward(x / 0.4).clamp(*ends)
+
+
+def test_bounds_that_are_reached_before_the_end_of_the_tanh_are_kept(tmp_path: Path) -> None:
+    layers = [*make_layers()[:-1], Reached()]
+    policy, seen = Policy.from_layers(layers), observations()
+    with torch.no_grad():
+        layers[-3].weight.mul_(20.0)
+        policy = Policy.from_layers(layers)
+        expected = nn.Sequential(*layers)(torch.from_numpy(seen)).numpy()
+    assert [type(layer).__name__ for layer in policy.layers[-3:]] == ["Tanh", "Scale", "Clip"]
+    loaded = load_policy(save_policy(policy, tmp_path))
+    for driver in (policy, loaded):
+        np.testing.assert_allclose(driver(seen), expected, rtol=0, atol=1e-4)
+    for bound in (expected.min(0), expected.max(0)):
+        assert ((expected == bound).mean(0) > 0.01).all()
+
+
 def test_it_does_not_learn_on_with_the_network() -> None:
     layers = make_layers()
     policy = Policy.from_layers(layers)

@@ -62,17 +62,43 @@ def test_actions_reach_every_bound_and_none_beyond(maker):
     assert SPEC.is_in(found["action"][0])
 
 
+@pytest.mark.parametrize("spec", [None, SPEC])
+@pytest.mark.parametrize("limit", [0.3, 1.5, 4.0])
+@pytest.mark.parametrize("maker", MAKERS)
+def test_actions_are_at_their_bounds_from_the_saturation_limit_on(maker, limit, spec):
+    policy = make(maker, spec, saturation_limit=limit)
+    low, high = (
+        (torch.full((2,), -1.0), torch.ones(2)) if spec is None else map(torch.tensor, (LOW, HIGH))
+    )
+    squash = policy.layers()[-2:]
+    at = torch.tensor([-9.0, -limit, -0.9 * limit, 0.0, limit, 9.0]).unsqueeze(-1).expand(6, 2)
+    found = squash[1](squash[0](at))
+    for row, bound in ((0, low), (1, low), (3, (low + high) / 2), (4, high), (5, high)):
+        torch.testing.assert_close(found[row], bound, rtol=1e-6, atol=1e-6)
+    assert bool((found[2] > low).all()) and bool((found[0] == low).all())
+    observed = {"observation": torch.randn(400, 5)}
+    with torch.no_grad():
+        policy.layers()[-3].weight.mul_(20.0)
+    for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        with set_exploration_type(kind):
+            ways = policy.outputs(observed), policy(TensorDict(observed, [400]))
+        for action in (way["action"] for way in ways):
+            assert bool(((action >= low) & (action <= high)).all())
+            assert all(bool((action == bound).any()) for bound in (low, high))
+    torch.testing.assert_close(*(way["action"] for way in ways))
+
+
 @pytest.mark.parametrize("maker", MAKERS)
 def test_layers_lead_from_the_observation_to_the_greedy_action(maker):
-    for spec in (SPEC, None):
-        policy = make(maker, spec, layers=3)
+    for spec, limit in ((SPEC, None), (None, None), (SPEC, 0.1), (None, 0.1)):
+        policy = make(maker, spec, layers=3, saturation_limit=limit)
         at = observed = torch.randn(4, 5)
         for layer in policy.layers():
             at = layer(at)
         torch.testing.assert_close(at, policy.outputs({"observation": observed})["action"])
         kinds = [type(layer) for layer in policy.layers()]
         assert kinds[:3] == [nn.Linear, nn.LayerNorm, nn.ReLU]
-        assert kinds[-1] is (nn.Tanh if spec is None else ActionScale)
+        assert kinds[-1] is (nn.Tanh if spec is None and limit is None else ActionScale)
 
 
 @pytest.mark.parametrize("maker", MAKERS)

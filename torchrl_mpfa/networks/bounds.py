@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
+
+from torchrl_mpfa.checks import POSITIVE, check
 
 
 def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tuple[Tensor, Tensor]:
@@ -61,32 +64,49 @@ def given_bounds(action_spec: TensorSpec | None, bounds: Any) -> tuple[Tensor, T
 
 
 class ActionScale(nn.Module):
-    r"""Affine map from [-1, 1] to the bounds of actions ``[A]``, :math:`a = c + h \tanh u`.
+    r"""Map from [-1, 1] to the bounds of actions ``[A]``, :math:`a = c + h \tanh u`.
+
+    With a saturation limit :math:`l` actions reach their bounds at :math:`|u| = l`, not in
+    infinity: :math:`a = \mathrm{clip}(c + h \tanh u / \tanh l)`.
 
     Examples:
         >>> scale = ActionScale(torch.tensor([0.0]), torch.tensor([10.0]))
         >>> scale(torch.tensor([[-1.0], [0.0], [1.0]])).flatten().tolist()
         [0.0, 5.0, 10.0]
+        >>> reached = ActionScale(-torch.ones(1), torch.ones(1), saturation_limit=1.5)
+        >>> reached(torch.tensor([1.0, 1.5, 2.0]).tanh()).tolist()[1:]
+        [1.0, 1.0]
     """
 
     center: Tensor
     half_width: Tensor
+    low: Tensor
+    high: Tensor
 
-    def __init__(self, low: Tensor, high: Tensor) -> None:
+    def __init__(self, low: Tensor, high: Tensor, *, saturation_limit: float | None = None) -> None:
         super().__init__()
+        self.clips = saturation_limit is not None
+        reached = 1.0
+        if saturation_limit is not None:
+            check(POSITIVE, saturation_limit=saturation_limit)
+            reached = math.tanh(saturation_limit)
+            self.register_buffer("low", low)
+            self.register_buffer("high", high)
         self.register_buffer("center", (high + low) / 2)
-        self.register_buffer("half_width", (high - low) / 2)
+        self.register_buffer("half_width", (high - low) / (2 * reached))
 
     def forward(self, action: Tensor) -> Tensor:
         """Map [-1, 1] to the bounds, each of shape ``[..., A]``."""
-        return torch.addcmul(self.center, self.half_width, action)
+        scaled = torch.addcmul(self.center, self.half_width, action)
+        return scaled.clamp(self.low, self.high) if self.clips else scaled
 
 
-def action_scale(action_spec: TensorSpec | None, action_size: int) -> ActionScale | None:
-    """Make the layer after a policy's tanh; None if actions are in [-1, 1]."""
-    if action_spec is None:
+def action_scale(
+    action_spec: TensorSpec | None, action_size: int, *, saturation_limit: float | None = None
+) -> ActionScale | None:
+    """Make the layer after a policy's tanh; None if actions are the tanh itself."""
+    one = torch.ones(action_size)
+    low, high = (-one, one) if action_spec is None else action_bounds(action_spec, action_size)
+    if saturation_limit is None and bool((low == -1.0).all() and (high == 1.0).all()):
         return None
-    low, high = action_bounds(action_spec, action_size)
-    if bool((low == -1.0).all() and (high == 1.0).all()):
-        return None
-    return ActionScale(low, high)
+    return ActionScale(low, high, saturation_limit=saturation_limit)

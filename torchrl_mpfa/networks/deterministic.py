@@ -159,6 +159,7 @@ def make_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
+    saturation_limit: float | None = None,
     width: int = 256,
     layers: int = 2,
     layer_norm: bool = True,
@@ -171,6 +172,10 @@ def make_actor(
         action_size: ``A``.
         action_spec: A bounded spec, such as ``env.action_spec``: actions are the tanh, scaled to
             its bounds. None: actions are in [-1, 1].
+        saturation_limit: Preactivation at which an action reaches its bound (see
+            :class:`~torchrl_mpfa.networks.ActionScale`): give the limit of the loss's penalty,
+            which holds actions at 0.905 of their bounds otherwise, for a limit of 1.5. None: the
+            bound is approached, and never reached.
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: True to normalize each hidden layer, so that no feature grows without bound.
@@ -181,7 +186,8 @@ def make_actor(
         A module for TorchRL's losses and collectors.
 
     Raises:
-        ValueError: If a size is not a positive integer, or the spec has other actions.
+        ValueError: If a size is not a positive integer, the spec has other actions, or the limit is
+            not positive.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -192,7 +198,7 @@ def make_actor(
     """
     check_counts(observation_size=observation_size, action_size=action_size)
     perceptron = Perceptron(width, layers, layer_norm, final_init)
-    scale = action_scale(action_spec, action_size)
+    scale = action_scale(action_spec, action_size, saturation_limit=saturation_limit)
     actor = Actor(observation_size, action_size, perceptron, scale=scale)
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
 

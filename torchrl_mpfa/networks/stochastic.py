@@ -91,12 +91,16 @@ class StochasticActor(ProbabilisticActor):
     ) -> None:
         one = torch.ones(action_size)
         low, high = (-one, one) if scale is None else (scale(-one), scale(one))
+        ends: dict[str, Tensor] = {}
+        if scale is not None:  # Of the distribution, which are beyond the bounds if it is clipped.
+            ends = {"low": scale.center - scale.half_width, "high": scale.center + scale.half_width}
         super().__init__(
             DirectModule(network, in_keys=["observation"], out_keys=["preactivation", "scale"]),
             in_keys={"loc": "preactivation", "scale": "scale"},
             spec=Bounded(low, high, (action_size,)),
+            safe=scale is not None and scale.clips,
             distribution_class=TanhNormal,
-            distribution_kwargs={} if scale is None else {"low": low, "high": high},
+            distribution_kwargs=ends,
         )
         self.action_scale = scale
 
@@ -120,9 +124,13 @@ class StochasticActor(ProbabilisticActor):
                 found["preactivation"], found["scale"], self.action_scale
             )
         else:
-            action = torch.tanh(found["preactivation"])
-            action = action if self.action_scale is None else self.action_scale(action)
+            action = self.mean_action(found["preactivation"])
         return {**found, "action": action}
+
+    def mean_action(self, preactivation: Tensor) -> Tensor:
+        """Squash the mean before the tanh, ``[..., A]``, to the action without noise."""
+        action = torch.tanh(preactivation)
+        return action if self.action_scale is None else self.action_scale(action)
 
     def sample(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
@@ -138,6 +146,7 @@ def make_stochastic_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
+    saturation_limit: float | None = None,
     width: int = 256,
     layers: int = 2,
     layer_norm: bool = True,
@@ -153,6 +162,8 @@ def make_stochastic_actor(
         observation_size: ``O``.
         action_size: ``A``.
         action_spec: As in :func:`~torchrl_mpfa.make_actor`.
+        saturation_limit: As in :func:`~torchrl_mpfa.make_actor`. Densities are those of actions
+            before the clipping.
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
@@ -163,7 +174,8 @@ def make_stochastic_actor(
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
 
     Raises:
-        ValueError: If a size is not a positive integer, or the spec has other actions.
+        ValueError: If a size is not a positive integer, the spec has other actions, or the limit is
+            not positive.
 
     Examples:
         >>> policy = make_stochastic_actor(24, 2)
@@ -175,5 +187,5 @@ def make_stochastic_actor(
     check_counts(observation_size=observation_size, action_size=action_size)
     perceptron = Perceptron(width, layers, layer_norm, final_init)
     network = StochasticNetwork(observation_size, action_size, perceptron)
-    scale = action_scale(action_spec, action_size)
+    scale = action_scale(action_spec, action_size, saturation_limit=saturation_limit)
     return StochasticActor(network, action_size=action_size, scale=scale)

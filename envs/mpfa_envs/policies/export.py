@@ -16,7 +16,7 @@ import numpy as np
 from mpfa_envs.deploy.card import FORMAT, SCALES, Card, CardError, card_file
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.files import write_atomically
-from mpfa_envs.policies.layers import Choice, LayerNorm, Linear, ReLU, Scale, Tanh
+from mpfa_envs.policies.layers import Choice, Clip, LayerNorm, Linear, ReLU, Scale, Tanh
 
 if TYPE_CHECKING:
     import os
@@ -226,6 +226,10 @@ class _Graph:
         elif isinstance(layer, Scale):
             self.add("Mul", self.last, self.weight(layer.half))
             self.add("Add", self.last, self.weight(layer.center))
+        elif isinstance(layer, Clip):
+            # ONNX's own clips by one number, not by one of each action.
+            self.add("Max", self.last, self.weight(layer.low))
+            self.add("Min", self.last, self.weight(layer.high))
         elif isinstance(layer, Choice):
             self.add("ArgMax", self.last, axis=-1, keepdims=0)
             self.add("Gather", self.weight(layer.actions), self.last)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -108,6 +109,20 @@ class Scale(_SameSize):
 
 
 @dataclass(frozen=True)
+class Clip(_SameSize):
+    """``y = min(max(x, low), high)``, which keeps actions within their bounds."""
+
+    low: NDArray[np.float32]
+    """Shape ``[size]``."""
+    high: NDArray[np.float32]
+    """Shape ``[size]``."""
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """From ``[N, size]`` to the same shape."""
+        return np.clip(x, self.low, self.high)
+
+
+@dataclass(frozen=True)
 class Table:
     """Values of the cell that an observation lies in, see ``Binning``."""
 
@@ -160,9 +175,9 @@ class Choice:
         return int(self.actions.shape[1])
 
 
-Layer = Linear | LayerNorm | ReLU | Tanh | Scale | Table | Choice
+Layer = Linear | LayerNorm | ReLU | Tanh | Scale | Clip | Table | Choice
 KINDS: Final[Mapping[str, Callable[..., Layer]]] = {
-    kind.__name__: kind for kind in (Linear, LayerNorm, ReLU, Tanh, Scale, Table, Choice)
+    kind.__name__: kind for kind in (Linear, LayerNorm, ReLU, Tanh, Scale, Clip, Table, Choice)
 }
 """The layers that a policy may have, by name."""
 
@@ -211,27 +226,33 @@ def from_torch(modules: Iterable[Any]) -> list[Layer]:
         elif isinstance(module, nn.Tanh):
             layers.append(Tanh())
         elif not isinstance(module, nn.Identity):
-            layers.append(_scale(module, layers))
+            layers += _scale(module, layers)
     return layers
 
 
-def _scale(module: Any, before: Sequence[Layer]) -> Scale:
-    """Read an affine map from its values at actions in [-1, 1]."""
+def _scale(module: Any, before: Sequence[Layer]) -> list[Layer]:
+    """Read an affine map, and where it is clipped, from its values at actions in [-1, 1]."""
     import torch
 
     linear = [layer for layer in before if isinstance(layer, Linear)]
     if linear and isinstance(before[-1], Tanh):
         size = len(linear[-1].bias)
-        levels = torch.linspace(-1.0, 1.0, 5)
+        near, ends = 2.0**-10, torch.linspace(-1.0, 1.0, 5, dtype=torch.double)
+        levels = torch.cat((ends, torch.tensor([-near, near], dtype=torch.double))).unsqueeze(-1)
         with torch.no_grad():
             try:
-                found = _array(module(levels.unsqueeze(-1).expand(5, size)))
-            except (TypeError, RuntimeError):
-                found = np.empty(0, np.float32)
-        if found.shape == (5, size):
-            scale = Scale(center=found[2], half=(found[4] - found[0]) / 2)
-            if np.allclose(scale(levels.unsqueeze(-1).numpy()), found, rtol=1e-5):
-                return scale
+                found = copy.deepcopy(module).double()(levels.expand(7, size)).numpy()
+            except (TypeError, RuntimeError, AttributeError):
+                found = np.empty(0)
+        if found.shape == (7, size):
+            slope = (found[6] - found[5]) / (2 * near)
+            scale = Scale(found[2].astype(np.float32), slope.astype(np.float32))
+            clip = Clip(found.min(0).astype(np.float32), found.max(0).astype(np.float32))
+            values = scale(levels.numpy())
+            if np.allclose(values, found, rtol=1e-5):
+                return [scale]
+            if np.allclose(clip(values), found, rtol=1e-5):
+                return [scale, clip]
     raise ValueError(
         f"layers must be among {sorted(KINDS)} and Identity, or map a Tanh to the bounds of "
         f"actions, got {module!r}"

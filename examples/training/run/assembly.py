@@ -61,7 +61,8 @@ def make_learner(
         return _dqn(settings, method, make_value_network(*sizes, **network).to(device))
     critic = make_critic(*sizes, late_action=settings.late_action, **network)
     make = make_stochastic_actor if settings.algorithm == "sac" else make_actor
-    actor = make(*sizes, **network)
+    limit = settings.saturation_limit
+    actor = make(*sizes, **network, saturation_limit=limit if settings.full_range else None)
     of_loss: Options = {
         **loss_options(method),
         "gamma": settings.gamma,

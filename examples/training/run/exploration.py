@@ -203,8 +203,8 @@ class RandomPolicy(Explorer):
         """Sample actions from the policy."""
         with set_exploration_type(ExplorationType.RANDOM):
             found = self.policy.outputs({"observation": observation})
+        mean = self.policy.mean_action(found["preactivation"]).cpu()
         action: Tensor = found["action"]
-        mean = found["preactivation"].tanh().cpu()
         self._behavior = mean, torch.full((len(mean), 1), self.sigma)
         return action
 

@@ -51,9 +51,12 @@ class LearnerSettings:
     """Factor of the penalty on actions in the tanh's flat ends."""
     saturation_limit: float = setting(1.5, NOT_NEGATIVE)
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
+    full_range: bool = False
+    """True if actions reach their bounds at ``saturation_limit``. The tanh alone ends there at
+    0.905: the robot never drives at its full speed."""
     compile: bool | str = setting("auto", _COMPILE)
     """Make one program of an update, which halves its time: ``true``, ``false``, or ``auto``: from
-    10,000 updates on. Needs a C++ compiler, the headers of Python, and some seconds at the
+    5,000 updates on. Needs a C++ compiler, the headers of Python, and some seconds at the
     start."""
     policy_delay: int = setting(1, at_least(1))
     """DDPG and TD3: updates of the critics for one of the actor and the targets."""

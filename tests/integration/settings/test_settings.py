@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from functools import reduce
 from itertools import zip_longest
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from hydra.core.global_hydra import GlobalHydra
+from torch import nn
 
+from mpfa_envs import Policy
+from mpfa_envs.policies.layers import Tanh
 from tests.mpfa.losses import make_batch
 from torchrl_mpfa.checks import rules_of
-from training.run.assembly import make_learner
+from training.run.assembly import make_learner, policy_layers
 from training.settings.checks import OF_A_METHOD, check_settings
 from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import with_lines
@@ -124,6 +130,29 @@ def test_a_learner_learns_with_every_loss_function_that_the_settings_take(
     settings = one(f"learner={algorithm}", f"method.loss_function={word}", "learner.compile=false")
     learner = make_learner(settings.learner, settings.method, 5, 2)
     assert learner.update(make_batch())["loss_value"].isfinite()
+
+
+@pytest.mark.parametrize("limit", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])
+def test_every_learner_has_the_full_range_of_actions_at_the_limit(
+    algorithm: str, limit: float
+) -> None:
+    words = [f"learner={algorithm}", f"learner.saturation_limit={limit}", "learner.compile=false"]
+    for more, reached in (([], 1.0), (["learner.full_range=false"], math.tanh(limit))):
+        settings = one(*words, *more)
+        policy = make_learner(settings.learner, settings.method, 5, 2).policy
+        head = next(each for each in reversed(policy.layers()) if isinstance(each, nn.Linear))
+        with torch.no_grad():
+            head.weight.zero_()
+            head.bias.copy_(torch.tensor([limit, -limit]))
+        action = Policy(policy_layers(policy))(np.zeros(5, np.float32))
+        np.testing.assert_allclose(action, [reached, -reached], rtol=1e-6)
+
+
+def test_the_paper_has_the_tanh_alone() -> None:
+    settings = one("regime=paper")
+    policy = make_learner(settings.learner, settings.method, 5, 2).policy
+    assert [type(each) for each in policy_layers(policy)][-1] is Tanh
 
 
 def test_an_override_reaches_the_typed_settings() -> None:
