@@ -66,10 +66,13 @@ from training.worlds import parse_worlds, world_name
 
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
-    *("success", "collision", "timeout", "spl", "time_s"),
+    *("success", "collision", "timeout", "spl", "sct", "time_s"),
     *("path_length", "plan_s", "decision_s"),
 )
-_COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
+_COLUMNS = {
+    **dict.fromkeys(("success", "collision", "timeout"), "{:.1%}"),
+    **dict.fromkeys(("spl", "sct"), "{:.3f}"),
+}
 _BARN = {"barn_score": "{:.3f}"}
 """Columns of the task of that benchmark."""
 _LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}

@@ -55,15 +55,17 @@ class EvaluationRecord:
     collision: float
     timeout: float
     spl: float
+    sct: float
+    """Mean success weighted by completion time, see :func:`mpfa_envs.evaluation.results.sct`."""
     seconds: float
     """Wall-clock time that it took [s]."""
     trained_for: float
     """Wall-clock time of the run before it, less that of evaluations [s]."""
 
     def is_best(self, others: Sequence[EvaluationRecord]) -> bool:
-        """Return True if no other has a higher success, or the same success and a higher SPL."""
-        mine = (self.success, self.spl)
-        return all(mine >= (other.success, other.spl) for other in others)
+        """Return True if no other has a higher success, or the same success and a higher SCT."""
+        mine = (self.success, self.sct)
+        return all(mine >= (other.success, other.sct) for other in others)
 
 
 def last_best(records: Sequence[EvaluationRecord]) -> EvaluationRecord:

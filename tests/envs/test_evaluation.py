@@ -24,7 +24,7 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
-from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, spl, wilson
+from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, sct, spl, wilson
 from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.policies.layers import Linear, Tanh
@@ -57,6 +57,7 @@ def result(**changes: float) -> EpisodeResult:
     fields = {
         "episode": 0, "success": True, "collision": False, "timeout": False, "time_s": 10.0,
         "path_length": 4.0, "shortest_path": 3.0, "min_clearance": 0.5, "spl": 0.75,
+        "sct": 0.6,
     }  # fmt: skip
     return EpisodeResult(**{**fields, **changes})  # type: ignore[arg-type]
 
@@ -93,7 +94,7 @@ def test_without_two_values_there_is_no_interval(values: list[float]) -> None:
 
 
 def test_outcomes_sum_to_one_and_times_count_successes_alone() -> None:
-    failed = {"success": False, "spl": 0.0, "time_s": 50.0}
+    failed = {"success": False, "spl": 0.0, "sct": 0.0, "time_s": 50.0}
     summary = summarize(
         [result(), result(**failed, collision=True), result(**failed, timeout=True), result()]
     )
@@ -101,6 +102,7 @@ def test_outcomes_sum_to_one_and_times_count_successes_alone() -> None:
     assert sum(summary[k].value for k in ("success", "collision", "timeout")) == 1.0
     assert summary["time_s"].value == 10.0
     assert summary["spl"].value == pytest.approx(0.375)
+    assert summary["sct"].value == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(
@@ -110,6 +112,23 @@ def test_spl_is_the_shortest_path_over_the_driven_one(
     success: bool, driven: float, expected: float
 ) -> None:
     assert spl(success, path_length=driven, shortest_path=3.0) == expected
+
+
+@pytest.mark.parametrize(
+    ("success", "time_s", "expected"), [(True, 8.0, 0.75), (True, 5.9, 1.0), (False, 9.0, 0.0)]
+)
+def test_sct_is_the_time_of_the_shortest_path_at_full_speed_over_the_time_taken(
+    success: bool, time_s: float, expected: float
+) -> None:
+    assert sct(success, time_s=time_s, shortest_path=3.0, speed=0.5) == expected
+
+
+def test_full_speed_is_that_of_the_robot_that_drives() -> None:
+    for robot, speed in (("turtlebot2", 0.5), ("kobuki", 0.7)):
+        arguments = {"episodes": 4, "physics": "kinematic", "robot": robot, "envs_at_once": 4}
+        results = evaluate(lambda seen: np.tile([1.0, 0.96], (len(seen), 1)), "A", **arguments)
+        for each in results:
+            assert each.sct == each.success * each.shortest_path / speed / each.time_s
 
 
 @pytest.mark.parametrize("envs_at_once", [1, 4])

@@ -216,7 +216,7 @@ def test_the_table_has_the_score_of_barn_where_its_task_is_driven(
     summary = evaluate.main([str(run), "--worlds", "barn", "A", *how])
     assert summary["barn_score"].notna().tolist() == [True, False, True]
     header = next(line for line in capsys.readouterr().out.splitlines() if "barn_score" in line)
-    assert header.split().index("barn_score") == header.split().index("spl") + 1
+    assert header.split().index("barn_score") == header.split().index("sct") + 1
     document = json.loads((run / "barn" / "evaluation.json").read_text())
     assert document["worlds"]["barn"]["barn_score"] == document["barn_score"]
     assert "barn_score" not in document["worlds"]["A"]
@@ -234,7 +234,7 @@ def test_an_archive_of_barn_that_there_is_not_is_rejected(
 
 
 def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
-    lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0)
+    lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0, 0.0)
     row = {"world": "A", "physics": "wheels", **summary_row([lost, lost])}
     document = evaluate.as_document([row])
     assert document["time_s"] is None

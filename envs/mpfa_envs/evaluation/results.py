@@ -36,6 +36,8 @@ class EpisodeResult:
     """Least distance between the robot's rim and an obstacle, wall or walker [m]."""
     spl: float
     """Success weighted by path length, see :func:`spl`."""
+    sct: float
+    """Success weighted by completion time, see :func:`sct`."""
     plan_s: float = field(default=0.0, compare=False)
     """Wall-clock time of planning before the first action [s]. Results that differ in times of the
     machine alone are equal."""
@@ -77,6 +79,28 @@ def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
         0.75
     """
     return success * shortest_path / max(path_length, shortest_path)
+
+
+def sct(success: bool, *, time_s: float, shortest_path: float, speed: float) -> float:
+    """Success weighted by completion time, of one episode (https://arxiv.org/abs/2103.08022).
+
+    The least time counts no turns and no acceleration: no robot reaches 1.
+
+    Args:
+        success: True if the goal was reached.
+        time_s: Simulated time [s].
+        shortest_path: Shortest path of the task [m].
+        speed: Greatest speed of the robot [m/s].
+
+    Returns:
+        0 for a failure, 1 for a success in the time of the shortest path at the greatest speed.
+
+    Examples:
+        >>> sct(True, time_s=10.0, shortest_path=3.0, speed=0.5)
+        0.6
+    """
+    least = shortest_path / speed
+    return success * least / max(time_s, least)
 
 
 def barn_score(success: bool, *, time_s: float, reference_path: float) -> float:
@@ -141,6 +165,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         "collision": wilson([result.collision for result in results]),
         "timeout": wilson([result.timeout for result in results]),
         "spl": bootstrap([result.spl for result in results], rng),
+        "sct": bootstrap([result.sct for result in results], rng),
         "time_s": bootstrap([result.time_s for result in reached], rng),
         "path_length": bootstrap([result.path_length for result in reached], rng),
         "min_clearance": bootstrap([result.min_clearance for result in results], rng),

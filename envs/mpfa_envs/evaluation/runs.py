@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, spl
+from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, sct, spl
 from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
@@ -337,7 +337,8 @@ def _drive(
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
             number, at_work[robot] = int(at_work[robot]), -1
             times = float(planned[robot]), float(decided[robot] / decisions[robot])
-            yield robot, number, _result(tasks, number, robot, info, *times)
+            speed = env.config.robot.max_wheel_speed
+            yield robot, number, _result(tasks, number, robot, info, speed, *times)
 
 
 def _begin(
@@ -364,6 +365,7 @@ def _result(
     number: int,
     robot: int,
     info: dict[str, NDArray[Any]],
+    speed: float,
     plan_s: float,
     decision_s: float,
 ) -> EpisodeResult:
@@ -382,6 +384,7 @@ def _result(
         shortest_path=shortest,
         min_clearance=float(info["min_clearance"][robot]),
         spl=spl(success, path_length=driven, shortest_path=shortest),
+        sct=sct(success, time_s=time_s, shortest_path=shortest, speed=speed),
         plan_s=plan_s,
         decision_s=decision_s,
         world=world.name,

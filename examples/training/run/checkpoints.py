@@ -21,7 +21,7 @@ from training.run.hooks import Hook
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
 
-FORMAT = 5
+FORMAT = 6
 """5: many robots, in the middle of their episodes."""
 
 

@@ -68,16 +68,16 @@ def evaluate_policy(
         trained_for: Wall-clock time of the training so far [s].
 
     Returns:
-        Rates of success, collision and timeout, and the mean SPL.
+        Rates of success, collision and timeout, and the means of SPL and SCT.
     """
     start = time.perf_counter()
     wanted, exported = settings.evaluation, exported_policy(policy, settings)
-    # A policy that some robots try without the filter is to be good without it.
+    # A policy of which some robots are without the filter is to be good without it.
     always = settings.environment.filter == 1.0 and not is_discrete(settings.learner)
     driver: Drivable = filtered(exported) if always else exported
     tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
     results = run_tasks(driver, tasks, **driver.env_arguments)
-    names = ("success", "collision", "timeout", "spl")
+    names = ("success", "collision", "timeout", "spl", "sct")
     return EvaluationRecord(
         total_steps=total_steps,
         episode=episode,

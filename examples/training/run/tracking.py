@@ -67,7 +67,7 @@ class Tracker(Hook):
 
     def on_evaluation(self, run: TrainingRun, record: EvaluationRecord) -> None:
         """Log an evaluation."""
-        rates = ("success", "collision", "timeout", "spl")
+        rates = ("success", "collision", "timeout", "spl", "sct")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
         self._log(entries, record.total_steps)
 

@@ -76,7 +76,7 @@ def test_episodes_that_end_at_one_action_are_all_in_the_log(tmp_path: Path, kept
     tracker = Tracker(TrainSettings(tracking=OFFLINE), tmp_path, run_id=None)
     for number, actions in enumerate((160, 160, 160, 176)):
         tracker.on_episode(run, episode(number, actions=actions))
-    found = EvaluationRecord(176, 4, "validation", 0.5, 0.5, 0.0, 0.4, 1.0, 2.0)
+    found = EvaluationRecord(176, 4, "validation", 0.5, 0.5, 0.0, 0.4, 0.3, 1.0, 2.0)
     tracker.on_evaluation(run, found)
     rows = list(kept.rows.values())
     ended = [row for row in rows if "train/episode" in row]
@@ -86,6 +86,7 @@ def test_episodes_that_end_at_one_action_are_all_in_the_log(tmp_path: Path, kept
     assert [row["time/steps_per_second"] for row in ended] == [160.0, 160.0, 160.0, 176.0]
     # All are plotted over the actions of the run.
     assert [row[kept.axes["*"]] for row in rows] == [160, 160, 160, 176, 176]
+    assert (rows[-1]["evaluation/spl"], rows[-1]["evaluation/sct"]) == (0.4, 0.3)
 
 
 def test_a_run_keeps_its_id_and_one_of_a_sweep_has_the_sweep_s(
