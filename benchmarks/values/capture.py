@@ -34,6 +34,11 @@ _COMMON = (
     "environment.robot=turtlebot2",
     "environment.filter=0",
     "environment.step_cost=0",
+    "environment.clearance=0.05",
+    "learner.gamma=0.99",
+    "learner.policy_noise=0.2",
+    "learner.noise_clip=0.5",
+    "learner.full_range=false",
 )
 REWARDS = {
     "sparse": (

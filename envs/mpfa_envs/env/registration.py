@@ -34,8 +34,8 @@ ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     }
 )
 """Arguments of :class:`~mpfa_envs.NavigationEnv` and :class:`~mpfa_envs.VectorNavigationEnv` for
-the task of ``regime=rooms`` for the paper's robot, without a filter and a cost of time: those of
-``mpfa/Rooms-v1``."""
+the task of ``regime=rooms`` for the paper's robot, without a filter and a cost of time, hence with
+more clearance: those of ``mpfa/Rooms-v1``."""
 
 
 def make_vector(

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
 
-_MANY_UPDATES = 10_000
+_MANY_UPDATES = 5_000
 """From here on a program saves more than it takes to make one."""
 _EPISODE = 100
 """Actions that an episode is counted as, of a run whose stages count episodes."""

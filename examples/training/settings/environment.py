@@ -65,7 +65,8 @@ class EnvironmentSettings:
     """Errors as a robot has them."""
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off obstacles
-    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1 a
-    policy needs the filter. DQN and Q learning have none."""
+    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1
+    evaluations have the filter, too, and a policy needs it. DQN and Q learning have none."""
     mirror: bool = True
-    """Show the learner half of its samples in the mirror."""
+    """Show the learner half of its samples in the mirror, which also swaps front and rear where a
+    robot has them alike."""

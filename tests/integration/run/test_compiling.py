@@ -14,15 +14,15 @@ from training.settings.train import register
     ("arguments", "compiled"),
     [
         ("", True),
-        ("curriculum.stages=[{world:A,actions:40000}]", True),
-        ("curriculum.stages=[{world:A,actions:39999}]", False),
+        ("curriculum.stages=[{world:A,actions:20000}]", True),
+        ("curriculum.stages=[{world:A,actions:19999}]", False),
         ("curriculum.stages=[{world:A,actions:100}] learner.compile=true", True),
         ("learner.compile=false", False),
         ("learner=sac", True),
         ("learner=dqn", False),
         ("regime=paper", True),
         ("regime=paper curriculum=A", True),
-        ("regime=paper curriculum.stages=[{world:A,episodes:99}]", False),
+        ("regime=paper curriculum.stages=[{world:A,episodes:49}]", False),
     ],
 )
 def test_a_run_is_compiled_by_its_settings_and_length(

@@ -358,5 +358,5 @@ def test_the_help_has_all_choices_and_the_values_of_those_that_are_given(
     train.main()
     said = capsys.readouterr().out
     assert "learner: ddpg, dqn, plain, q_learning, sac, td3" in said
-    assert "policy_noise: 0.2" in said
+    assert "policy_noise: 0.4" in said
     assert "name: td3" in said

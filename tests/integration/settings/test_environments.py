@@ -117,7 +117,7 @@ def test_a_lidar_that_sees_a_whole_turn_is_asked_for_and_mirrored(tmp_path: Path
     assert batch.shape[-1] == 36 + 6 + 36
     mirror = Mirror(sectors=36, history=1)
     transform = next(each for each in run.buffer._transform if isinstance(each, RandomMirror))
-    assert torch.equal(transform.mirror.observation(batch), mirror.observation(batch))
+    assert torch.equal(transform.mirrors[0].observation(batch), mirror.observation(batch))
 
 
 def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
@@ -128,8 +128,8 @@ def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> N
     training.close()
 
 
-OF_THE_PAPER = {"robot": "turtlebot2", "step_cost": 0.0}
-"""What the ids keep."""
+OF_THE_PAPER = {"robot": "turtlebot2", "step_cost": 0.0, "clearance": 0.05}
+"""What the ids keep, which have no filter."""
 
 
 @pytest.mark.parametrize(
