@@ -15,8 +15,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from mpfa_envs.robots.model import RobotModel, resolve_robot
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.report import table
@@ -27,10 +29,13 @@ from training.worlds import family
 _DRIVER = ["robot", "driver", "filter"]
 _COUNTED = ["success", "collision", "timeout"]
 _NAMES = {"dwa": "`dwa`", "dwa map": "`dwa --memory map`", "ddpg": "DDPG", "td3": "TD3"}
+_REFERENCE = "dwa map"
+"""Driver whose times others are divided by, of the same robot."""
+_TASK = ["world", "episode"]
 
 
-def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
-    """The rows of all evaluations in a folder, on any level."""
+def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+    """Read the driver and the episodes of each evaluation in a folder, on any level."""
     for path in sorted(folder.rglob(files.EPISODES)):
         asked = read_json(path.parent / files.SETTINGS)
         if "words" not in asked:  # Episodes of a training.
@@ -43,35 +48,76 @@ def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
             "seed": asked.get("card", asked)["seed"],
             "filter": "filter" in asked,
         }
-        episodes = read_table(path)
-        for kind, found in episodes.groupby(episodes["world"].map(family), sort=False):
-            yield {
-                **driver,
-                "worlds": kind,
-                "episodes": len(found),
-                **found[[*_COUNTED, "spl"]].astype(float).mean(),
-                "time_s": found.loc[found["success"], "time_s"].mean(),
-            }
+        yield driver, read_table(path)
+
+
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    """Make the rows of all evaluations in a folder."""
+    found = list(evaluations_of(folder))
+    # With the filter, where both ways were driven.
+    references = {
+        driver["robot"]: episodes[episodes["success"]].set_index(_TASK)["time_s"]
+        for driver, episodes in sorted(found, key=lambda each: each[0]["filter"])
+        if driver["driver"] == _REFERENCE
+    }
+    return [
+        {
+            **driver,
+            "worlds": kind,
+            "episodes": len(each),
+            **each[[*_COUNTED, "spl", "sct"]].astype(float).mean(),
+            "time_s": each.loc[each["success"], "time_s"].mean(),
+            **_beside(each, references.get(driver["robot"]), resolve_robot(driver["robot"])),
+        }
+        for driver, episodes in found
+        for kind, each in episodes.groupby(episodes["world"].map(family), sort=False)
+    ]
+
+
+def _beside(
+    episodes: pd.DataFrame, reference: pd.Series | None, robot: RobotModel
+) -> dict[str, float]:
+    """Divide times, and those of the driven paths at full speed, by the reference's times.
+
+    Over the tasks that both reach.
+    """
+    if reference is None:
+        return {}
+    reached = episodes[episodes["success"]].set_index(_TASK)
+    both = reached.join(reference.rename("reference"), how="inner")
+    time, bound = both["time_s"].sum(), both["path_length"].sum() / robot.max_wheel_speed
+    least = both["reference"].sum()
+    return {"time_ratio": time / least, "bound_ratio": bound / least} if len(both) else {}
 
 
 def tables_of(rows: pd.DataFrame) -> str:
-    """Two Markdown tables: success with the lowest of a driver's runs, and SPL and time."""
+    """Write Markdown tables of success, of paths and times, and of times beside the reference."""
     kinds = rows["worlds"].unique()
-    success, ways = [], []
+    success, paths, beside = [], [], []
     for _, runs in rows.groupby(_DRIVER, sort=False):
         robot, driver, filtered = runs[_DRIVER].iloc[0]
         cells = [f"`{robot}`", _NAMES.get(driver, f"`{driver}`"), "yes" if filtered else "no"]
         of = {kind: runs[runs["worlds"] == kind] for kind in kinds}
         rate = (runs["collision"] * runs["episodes"]).sum() / runs["episodes"].sum()
         success.append([*cells, *(_lowest(of[kind]["success"]) for kind in kinds), f"{rate:.2%}"])
-        way = (f"{of[kind]['spl'].mean():.3f}, {of[kind]['time_s'].mean():.1f}" for kind in kinds)
-        ways.append([*cells, *way])
-    return "\n\n".join(
-        (
-            table(["robot", "driver", "filter", *kinds, "collisions"], success),
-            table(["robot", "driver", "filter", *kinds], ways),
-        )
-    )
+        path = (f"{of[kind]['spl'].mean():.3f}, {of[kind]['time_s'].mean():.1f}" for kind in kinds)
+        paths.append([*cells, *path])
+        if "time_ratio" in runs and runs["time_ratio"].notna().all():
+            generated = runs[runs["worlds"].str.contains(":")]
+            each = [*(of[kind] for kind in kinds), generated]
+            beside.append([*cells, *map(_ratios, each)])
+    heads = ["robot", "driver", "filter", *kinds]
+    tables = [table([*heads, "collisions"], success), table(heads, paths)]
+    if beside:
+        tables.append(table([*heads, "generators"], beside))
+    return "\n\n".join(tables)
+
+
+def _ratios(runs: pd.DataFrame) -> str:
+    """Write the times and their bounds beside the reference: geometric means over kinds."""
+    means = runs.groupby("worlds")[["time_ratio", "bound_ratio"]].mean()
+    time, bound = np.exp(np.log(means).mean())
+    return f"{time:.3f} ({bound:.2f})"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

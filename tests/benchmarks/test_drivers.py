@@ -11,11 +11,12 @@ from benchmarks import drivers
 ROOT = Path(__file__).parents[2]
 
 
-def write_evaluation(folder, successes, **settings):
+def write_evaluation(folder, successes, times=(9.0, 9.0, 9.0), **settings):
     """Episodes of two kinds of worlds; what does not succeed collides."""
     folder.mkdir(parents=True)
     rows = pd.DataFrame({"success": successes, "spl": [float(each) for each in successes]})
-    rows["collision"], rows["timeout"], rows["time_s"] = ~rows["success"], False, 9.0
+    rows["collision"], rows["timeout"], rows["time_s"] = ~rows["success"], False, times
+    rows["sct"], rows["path_length"], rows["episode"] = 0.5 * rows["spl"], 3.5, [0, 0, 3]
     rows["world"] = ["bars-test-0", "bars-test-1", "barn-3"]
     rows.to_csv(folder / "episodes.csv", index=False)
     (folder / "settings.json").write_text(json.dumps({"words": ["bars:test", "barn"], **settings}))
@@ -52,6 +53,25 @@ def test_every_evaluation_becomes_a_row_for_each_kind_of_worlds(evaluations, cap
     assert "| `kobuki` | TD3 | yes | 75.0% [50%] | 100.0% [100%] | 16.67% |" in printed
     assert drivers.main([str(kept)]) == 0
     assert capsys.readouterr().out == printed
+
+
+def test_times_are_those_beside_a_dynamic_window_on_tasks_that_both_reach(evaluations, capsys):
+    every = [True, True, True]
+    planner = {"policy": "dwa", "memory": "map", "robot": "kobuki", "seed": 0}
+    write_evaluation(evaluations / "slow", every, (99.0, 99.0, 99.0), **planner)
+    write_evaluation(
+        evaluations / "dwa-filter", every, (10.0, 20.0, 30.0), filter={"clearance": 0.03}, **planner
+    )
+    assert drivers.main([str(evaluations), "--keep", str(evaluations / "rows.csv")]) == 0
+    rows = pd.read_csv(evaluations / "rows.csv").set_index(["robot", "driver", "seed", "worlds"])
+    # 9 s each beside 10 and 20 s; seed 5 has not reached the second. 3.5 m take 5 s at 0.7 m/s.
+    ratios = rows.loc["kobuki", "td3"][["time_ratio", "bound_ratio"]]
+    assert ratios.loc[4, "bars:test"].tolist() == [0.6, 0.3333]
+    assert ratios.loc[5, "bars:test"].tolist() == [0.9, 0.5]
+    assert ratios.loc[5, "barn"].tolist() == [0.3, 0.1667]
+    assert "| `kobuki` | TD3 | yes | 0.750 (0.42) | 0.300 (0.17) | 0.750 (0.42) |" in (
+        capsys.readouterr().out
+    )
 
 
 def test_a_folder_without_evaluations_is_rejected(tmp_path, capsys):
