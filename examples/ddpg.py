@@ -12,17 +12,39 @@ from __future__ import annotations
 import argparse
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
 from tqdm import tqdm
 
 import torchrl_mpfa as mpfa
-from mpfa_envs import ROOMS_TASK, Policy, RandomMirror, evaluate, make_navigation_env, save_policy
+from mpfa_envs import (
+    ROOMS_TASK,
+    Policy,
+    TaskConfig,
+    evaluate,
+    make_navigation_env,
+    navigation_reward,
+    save_policy,
+)
+from mpfa_envs.evaluation.runs import Filtered
 
+SENSES = {
+    "robot": "kobuki",
+    "physics": "kinematic",
+    "memory": "map",
+    # Of the radius: a robot that can stop must know how near it is.
+    "closeness_distance": 0.18,
+}
+"""What a policy must find again wherever it drives: how the robot moves and senses."""
+# A robot that can stand still has to be told that time costs something.
+REWARD = partial(navigation_reward, step_cost=0.05)
+TASK = {**ROOMS_TASK, **SENSES, "clearance": 0.02, "reward": REWARD}
 ROBOTS = 16
 STEPS = 8
 """Actions of each robot between two rounds of updates."""
@@ -31,6 +53,8 @@ ACTIONS_PER_UPDATE = 4
 CAPACITY = 100_000
 BATCH_SIZE = 256
 LEARNING_RATE = 3e-4
+LIMIT = 1.5
+"""Output before the tanh at which the wheels are at full speed."""
 EVALUATE_EVERY = 5_000
 """Actions of all robots between two evaluations."""
 EPISODES = 100
@@ -55,9 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
     # Sixteen robots, each in a new room in every episode. What brings them closer to the goal along
     # the shortest path is rewarded.
-    env = make_navigation_env(
-        **ROOMS_TASK, num_envs=ROBOTS, info_keys=["success"], seed=options.seed
-    )
+    env = make_navigation_env(**TASK, num_envs=ROBOTS, info_keys=["success"], seed=options.seed)
     size = env.observation_spec["observation"].shape[-1]
 
     # MPFA-PER: three signals of a transition (reward, TD error, action gradient), one priority.
@@ -66,16 +88,26 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         sampler=mpfa.MPFASampler(CAPACITY),
         batch_size=BATCH_SIZE,
     )
-    # Left and right are alike: half of what is sampled is shown in the mirror.
-    buffer.append_transform(RandomMirror(memory=ROOMS_TASK["memory"]))
+    # Left and right are alike, front and rear too: samples are shown in these mirrors by chance.
+    task = TaskConfig(**SENSES)
+    buffer.append_transform(task.make_mirror())
 
-    # DDPG. The penalty keeps actions out of the flat ends of the tanh, where nothing is learned.
-    actor, critic = mpfa.make_actor(size, 2, width=64), mpfa.make_critic(size, 2, width=64)
+    # DDPG. The penalty keeps actions out of the flat ends of the tanh, where nothing is learned;
+    # where it begins the wheels are at full speed. Delay and noise are those of TD3.
+    actor = mpfa.make_actor(size, 2, width=64, saturation_limit=LIMIT)
     loss = mpfa.make_ddpg_loss(
-        actor, critic, reward_scale=0.1, saturation_penalty=1.0, saturation_limit=1.5
+        actor,
+        mpfa.make_critic(size, 2, width=64),
+        gamma=0.95,
+        reward_scale=0.1,
+        saturation_penalty=1.0,
+        saturation_limit=LIMIT,
+        policy_noise=0.4,
+        noise_clip=0.8,
+        bounds=(-1.0, 1.0),
     )
     learner = mpfa.ActorCriticLearner(
-        loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005
+        loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005, policy_delay=2
     )
 
     falling = max(int(0.4 * options.actions), 1)
@@ -85,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     frames = ROBOTS * STEPS
     collector = Collector(
         env,
-        TensorDictSequential(actor, noise),
+        TensorDictSequential(actor, noise, filter_of(task)),
         frames_per_batch=frames,
         total_frames=-(-options.actions // frames) * frames,  # Whole batches.
         auto_register_policy_transforms=True,
@@ -124,20 +156,28 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
 
 def policy_of(actor: TensorDictModule, **card: object) -> Policy:
-    """A copy of the actor without noise, which needs no PyTorch.
-
-    It says what a policy must find again wherever it drives: how the robot moves and senses.
-    """
+    """A copy of the actor without noise, which needs no PyTorch."""
     return Policy.from_layers(
         actor.module.layers(),
         card={"learner": "ddpg", "method": "mpfa_per", **card},
-        env_arguments={name: ROOMS_TASK[name] for name in ("physics", "memory", "clearance")},
+        env_arguments=SENSES,
     )
 
 
+def filter_of(task: TaskConfig) -> TensorDictModule:
+    """The filter that keeps robots off what they see, as the last part of a policy."""
+    keep_off = task.make_filter()
+
+    def carried_out(observation: Tensor, action: Tensor) -> Tensor:
+        return torch.from_numpy(keep_off(observation.numpy(), action.numpy()))
+
+    return TensorDictModule(carried_out, in_keys=["observation", "action"], out_keys=["action"])
+
+
 def success_of(policy: Policy, worlds: str) -> float:
-    """Share of the episodes in these worlds that reach the goal."""
-    results = evaluate(policy, worlds, episodes=EPISODES)
+    """Share of the episodes in these worlds that reach the goal, behind the filter."""
+    driver = Filtered(policy, TaskConfig(**SENSES).make_filter())
+    results = evaluate(driver, worlds, episodes=EPISODES, **SENSES)
     return sum(each.success for each in results) / len(results)
 
 

@@ -34,7 +34,7 @@ def test_a_trained_policy_drives_as_evaluate_drives_it(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("briefly")
 def test_the_seed_decides_the_policy_to_the_last_bit(tmp_path: Path) -> None:
-    seen = np.random.default_rng(0).uniform(-1, 1, (50, 27)).astype(np.float32)
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 45)).astype(np.float32)
     one, same, other = (
         train(tmp_path / str(place), seed=seed)(seen) for place, seed in enumerate((3, 3, 4))
     )
@@ -56,7 +56,7 @@ def test_the_policy_of_the_best_evaluation_is_kept(
     monkeypatch.setattr(ddpg, "EVALUATE_EVERY", 128)
     monkeypatch.setattr(ddpg, "success_of", success_of)
     kept = train(tmp_path)
-    seen = np.ones(27, dtype=np.float32)
+    seen = np.ones(45, dtype=np.float32)
     assert len(judged) == 4
     assert judged[3] is judged[1]
     np.testing.assert_array_equal(kept(seen), judged[1](seen))
@@ -66,7 +66,7 @@ def test_the_policy_of_the_best_evaluation_is_kept(
 def test_it_needs_nothing_but_the_packages_and_a_progress_bar() -> None:
     page = Path(ddpg.__file__).read_text(encoding="utf-8")
     found = set(re.findall(r"^(?:from|import) (\w+)", page, re.MULTILINE))
-    standard = {"__future__", "argparse", "collections", "pathlib"}
+    standard = {"__future__", "argparse", "collections", "functools", "pathlib"}
     assert found - standard == {
         "mpfa_envs",
         "tensordict",
