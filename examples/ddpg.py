@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -34,7 +35,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.evaluation.runs import Filtered
 
-SENSES = {
+SENSES: dict[str, Any] = {
     "robot": "kobuki",
     "physics": "kinematic",
     "memory": "map",

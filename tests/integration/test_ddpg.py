@@ -66,7 +66,7 @@ def test_the_policy_of_the_best_evaluation_is_kept(
 def test_it_needs_nothing_but_the_packages_and_a_progress_bar() -> None:
     page = Path(ddpg.__file__).read_text(encoding="utf-8")
     found = set(re.findall(r"^(?:from|import) (\w+)", page, re.MULTILINE))
-    standard = {"__future__", "argparse", "collections", "functools", "pathlib"}
+    standard = {"__future__", "argparse", "collections", "functools", "pathlib", "typing"}
     assert found - standard == {
         "mpfa_envs",
         "tensordict",
