@@ -103,6 +103,14 @@ def test_writing_in_place_resets_the_slots_it_names(make_storage, cursor, slots)
     )
 
 
+def test_write_outside_of_the_storage_adds_no_rows(make_storage):
+    storage = make_storage(8)
+    storage.set(torch.arange(2), make_transitions(2))
+    with pytest.raises(IndexError, match="out of bounds"):
+        storage.set(torch.tensor([7, 8]), make_transitions(2))
+    assert len(storage) == storage.signal_table.size == 2
+
+
 def test_a_batch_larger_than_the_storage_leaves_signals_of_the_rows_that_stay(make_storage):
     storage = make_storage(4)
     buffer = make_buffer(4, storage=storage)

@@ -310,20 +310,11 @@ def test_a_priority_of_zero_that_was_learned_twice_is_still_learned():
         assert sampler.default_priority == 0.0
 
 
-def test_of_equal_priorities_the_first_is_that_of_the_highest_as_in_torchrl():
+def test_slot_of_the_highest_priority_is_that_of_torchrl():
     ours, theirs = TreeSampler(4, 1.0, 0.4), PrioritizedSampler(4, 1.0, 0.4)
-    for sampler in (ours, theirs):
-        for slot, priority in ((2, 3.0), (0, 1.0), (0, 3.0)):
-            sampler.update_priority(torch.tensor([slot]), torch.tensor([priority]))
-    assert int(ours._max_priority[1]) == int(theirs._max_priority[1]) == 2
-
-
-@pytest.mark.parametrize("first", [1.0, 3.0])
-def test_a_stratified_batch_has_one_slot_of_each_part_in_random_order(first):
-    sampler = TreeSampler(64, 1.0, 0.4, eps=0.0, stratified=True)
-    sampler._rng = seeded(0)
-    storage = filled(sampler, 64, 64)
-    sampler.update_priority(torch.arange(64), torch.full((64,), first))
-    slots = sampler.sample(storage, 32)[0]
-    assert (slots.sort().values // 2).tolist() == list(range(32))
-    assert not torch.equal(slots, slots.sort().values)
+    # Of equal priorities the first.
+    for slots, priority, highest in (([2], 3.0, 2), ([0], 1.0, 2), ([0], 3.0, 2), ([1, 3], 5.0, 3)):
+        for sampler in (ours, theirs):
+            values = torch.full((len(slots),), priority) - torch.arange(len(slots)).flip(0)
+            sampler.update_priority(torch.tensor(slots), values)
+        assert int(ours._max_priority[1]) == int(theirs._max_priority[1]) == highest
