@@ -255,10 +255,14 @@ def test_a_goal_reached_in_the_last_step_is_no_timeout() -> None:
     assert ends == [(True, False, True, False)] * 2 + [(False, True, False, True)]
 
 
-def test_a_robot_at_the_very_collision_distance_has_collided() -> None:
+@pytest.mark.parametrize(("goal", "success"), [((-4.0, 0.0), False), ((4.75, 0.5), True)])
+def test_a_robot_at_the_very_collision_distance_has_collided_unless_at_its_goal(
+    goal: tuple[float, float], success: bool
+) -> None:
     env = NavigationEnv(physics="kinematic", time_step=0.125, action_repeat=1, clearance=0.07)
     # A step is 1/16 m: 12 of them are exact.
-    env.reset(options={"start": (4.0, 0.0, 0.0), "goal": (-4.0, 0.0)})
-    ended = [env.step([1.0, 1.0])[2] for _ in range(12)]
+    env.reset(options={"start": (4.0, 0.0, 0.0), "goal": goal})
+    *before, last = [env.step([1.0, 1.0]) for _ in range(12)]
     assert env.trail[-1] == (4.75, 0.0)
-    assert ended == [False] * 11 + [True]
+    assert [step[2] for step in before] == [False] * 11 and last[2]
+    assert (last[4]["success"], last[4]["collision"]) == (success, not success)

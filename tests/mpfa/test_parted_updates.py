@@ -153,7 +153,7 @@ def test_learner_loaded_in_the_middle_of_a_step_learns_like_the_saved_one(name, 
     train(second, 1)
     for trains in ("both", "critic"):
         first.update(SampledBatch(make_batch(seed=30), trains, new_step=trains == "both"))
-    second.load_state_dict(deepcopy(first.state_dict()))
+    second.load_state_dict(first.state_dict())
     for learner in (first, second):
         torch.manual_seed(5)
         learner.update(SampledBatch(make_batch(seed=31), "actor", new_step=False))
