@@ -198,6 +198,19 @@ def test_a_robot_that_cannot_stop_keeps_room_for_a_circle() -> None:
     assert np.array_equal(far, ahead) and not np.array_equal(near, ahead)
 
 
+@pytest.mark.parametrize(
+    ("blocked", "drives"), [((8, 9), True), ((26, 27), True), ((8, 9, 26, 27), False)]
+)
+def test_one_free_circle_is_enough_for_a_robot_that_cannot_stop(
+    blocked: tuple[int, ...], drives: bool
+) -> None:
+    config = TaskConfig(**task("turtlebot2", lidar=AROUND))
+    ranges, ahead = np.full(36, 10.0), np.ones(2, np.float32)
+    ranges[[*blocked]] = 0.35  # To the left, to the right, or on both sides.
+    kept = config.make_filter()(observed(config, ranges, 0.5, 0.5), ahead)
+    assert np.array_equal(kept, ahead) == drives
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_where_no_circle_is_free_it_turns_to_the_freer_side(side: float) -> None:
     config = TaskConfig(**task("turtlebot2", lidar=AROUND))
