@@ -161,6 +161,21 @@ def test_of_a_slot_that_appears_twice_in_a_batch_the_last_entry_counts():
     assert priorities(buffer)[[3, 5]].tolist() == [2.0, 4.0]
 
 
+def test_of_slots_that_repeat_among_many_the_last_entry_counts_with_two_threads():
+    torch.set_num_threads(2)  # One writes in the order of the entries anyway.
+    buffer = make_filled(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
+    table = buffer.storage.signal_table
+    for seed in range(10):
+        slots = torch.randint(8, (40_000,), generator=seeded(seed))
+        batch = set_batch(buffer, slots)
+        error = torch.rand(40_000, generator=seeded(seed + 10))
+        batch["signals"] = TensorDict({"td_error": error, "action_gradient": error}, [40_000])
+        buffer.update_tensordict_priority(batch)
+        last = dict(zip(slots.tolist(), error.tolist(), strict=True))
+        assert table.rows[[*last], table.column["td_error"]].tolist() == [*last.values()]
+        assert priorities(buffer)[[*last]].tolist() == [*last.values()]
+
+
 def test_a_fresh_transition_gets_the_highest_priority_in_the_buffer_before_alpha():
     buffer = make_buffer(16)
     buffer.extend(make_transitions(4))
@@ -195,16 +210,19 @@ class CountingFusion:
 
 
 @pytest.mark.parametrize(
-    ("refresh", "expected"), [(0.0, 6), (0.25, 2), (100.0, 1)], ids=["always", "quarter", "never"]
+    ("refresh", "expected"),
+    [(0.0, [1, 2, 3, 4, 5, 6]), (0.25, [1, 1, 1, 1, 1, 2]), (100.0, [1] * 6)],
+    ids=["always", "quarter", "never"],
 )
 def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten(refresh, expected):
     fusion = CountingFusion()
     buffer = make_filled(16, fusion=fusion, entropy_refresh=refresh)
-    buffer.update_tensordict_priority(write_signals(buffer.sample()))
-    for number in range(5):
-        buffer.add(make_transitions(1, first=16 + number)[0])
+    asked = []
+    for number in range(6):
         buffer.update_tensordict_priority(write_signals(buffer.sample()))
-    assert fusion.asked == expected
+        asked.append(fusion.asked)
+        buffer.add(make_transitions(1, first=16 + number)[0])
+    assert asked == expected
 
 
 def test_a_refresh_of_zero_counts_at_every_update_even_if_nothing_was_written():
