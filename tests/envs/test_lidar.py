@@ -53,6 +53,14 @@ def test_a_ray_along_an_edge_meets_its_corner(shapes: dict[str, tuple[object, ..
     assert ranges == pytest.approx(1.0)
 
 
+def test_no_ray_slips_between_two_edges() -> None:
+    wedge = World(name="wedge", polygons=(Polygon(((1.0, 0.0), (3.0, -1.0), (3.0, 1.0))),))
+    lidar, rng = Lidar(wedge, sectors=1, reduction="single"), np.random.default_rng(0)
+    for x, y in rng.uniform((-4.0, -0.2), (0.5, 0.2), (2000, 2)).tolist():
+        (found,) = lidar.cast(x, y, math.atan2(-y, 1.0 - x))
+        assert found == pytest.approx(math.hypot(1.0 - x, y), abs=1e-6)
+
+
 def test_a_ray_that_meets_nothing_reports_the_longest_range() -> None:
     lidar = Lidar(World(name="hall", size=(100.0, 100.0)), max_range=7.0)
     np.testing.assert_array_equal(lidar.scan(0.0, 0.0, 0.3), 7.0)
