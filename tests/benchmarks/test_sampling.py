@@ -95,18 +95,26 @@ def test_the_bars_of_a_figure_are_as_high_as_what_they_count(tmp_path: Path) -> 
         assert ratio == pytest.approx(counted[kind] / counted[KINDS[0]], rel=0.05)
 
 
+def page_of(name: str) -> str:
+    """The page of a method; parts and baselines share one."""
+    own = DOCS / f"{name}.md"
+    return (own if own.exists() else DOCS / "baselines.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_method_has_a_page_with_its_source_and_a_figure_unless_it_is_uniform(
     name: str,
 ) -> None:
-    page = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    page = page_of(name)
     pictured = not samples_uniformly(METHODS[name])
     assert (f"(images/{name}.png)" in page) == pictured
     assert (DOCS / "images" / f"{name}.png").exists() == pictured
-    for part in ("## Formula", "## Source, and what is verified", "## Settings"):
+    shared = f"## `{name}`\n" in page
+    for part in ("doi.org",) if shared else ("## Formula", "| source |"):
         assert part in page
     overview = (DOCS / "README.md").read_text(encoding="utf-8")
-    assert f"[`{name}`]({name}.md)" in overview
+    link = f"baselines.md#{name}" if shared else f"{name}.md"
+    assert f"[`{name}`]({link})" in overview
     assert "examples/train.py method=NAME" in overview
 
 
@@ -121,4 +129,4 @@ def test_what_has_no_figure_samples_every_transition_as_often(name: str) -> None
 
 @pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw", "rud"])
 def test_a_reconstruction_is_called_one(name: str) -> None:
-    assert "reconstruction" in (DOCS / f"{name}.md").read_text(encoding="utf-8").lower()
+    assert "reconstruction" in page_of(name).lower()
