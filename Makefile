@@ -9,7 +9,7 @@
 #                                  others than the last ones install again
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
-#   DEMO_ACTIONS=40000             length of demo's training, in actions
+#   DEMO_ACTIONS=30000             length of demo's training, in actions
 #   EPISODES=50                    evaluation episodes of demo in the worlds of each generator
 #   SLOW=1                         test: include the slow tests
 #   WORKERS=4                      test: number of processes, 2 by default; 0: one, with live output
@@ -23,7 +23,7 @@ PYTHON ?=
 TORCH_INSTALL_ARGS ?=
 ARGS ?=
 REGIME ?= rooms
-DEMO_ACTIONS ?= 40000
+DEMO_ACTIONS ?= 30000
 EPISODES ?= 50
 SLOW ?=
 WORKERS ?= 2

@@ -45,7 +45,7 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalTensorStorage,
 )
-from training.evaluating import Drivable, drive
+from training.evaluating import Drivable, drive, filtered
 from training.pictures import Values, longest, trajectories_of
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -90,15 +90,15 @@ def save(picture: Any, path: Path) -> None:
 def rooms(output: Path) -> None:
     """Paths in nine rooms of different kinds."""
     kinds = ("rooms", "clutter", "bars", "fields", "mazes")
-    policy = load_policy(SHIPPED)
-    driven = drive(policy, [f"{kind}:test" for kind in kinds], episodes=200, **_HOW)
+    driver = filtered(load_policy(SHIPPED))
+    driven = drive(driver, [f"{kind}:test" for kind in kinds], episodes=200, **_HOW)
     save(trajectories_of(driven, size=_TILE), output / "rooms.png")
 
 
 def methods(output: Path) -> None:
     """Paths of a policy of today, one of the paper's task, and a planner, side by side."""
     drivers: dict[str, Drivable] = {
-        "many rooms": load_policy(SHIPPED),
+        "many rooms": filtered(load_policy(SHIPPED)),
         "four maps": load_policy("td3-paper"),
         "planner": make_planner("dwa"),
     }
@@ -115,15 +115,15 @@ def methods(output: Path) -> None:
     save(picture, output / "methods.png")
 
 
-def filmed(policy: Policy) -> tuple[int, WorldTask]:
+def filmed(driver: Drivable) -> tuple[int, WorldTask]:
     """Number and task of the animation: the longest of twenty in mazes that ends in the goal."""
-    return longest(drive(policy, [MAZE], episodes=20, **_HOW))
+    return longest(drive(driver, [MAZE], episodes=20, **_HOW))
 
 
 def episode(output: Path) -> None:
     """A drive through a maze of the test set to its goal, with lidar, map and trail."""
-    policy = load_policy(SHIPPED)
-    _write_film(policy, filmed(policy), output / "episode.gif")
+    driver = filtered(load_policy(SHIPPED))
+    _write_film(driver, filmed(driver), output / "episode.gif")
 
 
 def navigation(output: Path) -> None:
@@ -133,11 +133,11 @@ def navigation(output: Path) -> None:
     _write_film(policy, found, output / "navigation.gif")
 
 
-def _write_film(policy: Policy, found: tuple[int, WorldTask], path: Path) -> None:
+def _write_film(driver: Drivable, found: tuple[int, WorldTask], path: Path) -> None:
     """Drive a task, by its number and itself, and write the pictures."""
     number, task = found
     how: dict[str, Any] = {"traces": False, "seed": number, "physics": PHYSICS}
-    film = film_episode(policy, task, most=_FRAMES, **how)
+    film = film_episode(driver, task, most=_FRAMES, **how)
     time = film.frame_time
     write_animation(film.frames, path, frame_time=time, speed=_SPEED, most=_FRAMES + 1)
 

@@ -8,7 +8,7 @@
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
     python examples/compare.py --ray HEAD:6379            on all machines of a Ray cluster
 
-A run of the default 50,000 actions, with its evaluation, takes some one and a half minutes of a
+A run of the default 30,000 actions, with its evaluation, takes some one and a half minutes of a
 core: on two cores the first line takes some eight minutes, the second a quarter of an hour. Each of
 the --jobs processes makes one run after another, with the numbers of train.py and evaluate.py alone
 and without the ten seconds or more that a process takes to start.

@@ -160,7 +160,7 @@ def policy_of(actor: TensorDictModule, **card: object) -> Policy:
     """A copy of the actor without noise, which needs no PyTorch."""
     return Policy.from_layers(
         actor.module.layers(),
-        card={"learner": "ddpg", "method": "mpfa_per", **card},
+        card={"learner": "ddpg", "method": "mpfa_per", "filter": True, **card},
         env_arguments=SENSES,
     )
 

@@ -55,6 +55,7 @@ from training.evaluating import (
     drive,
     evaluation_folder,
     filtered,
+    needs_filter,
     summary_row,
     tasks_of,
 )
@@ -133,8 +134,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--filter",
-        action="store_true",
-        help="let actions pass a filter that keeps the robot off what its lidar sees",
+        action=argparse.BooleanOptionalAction,
+        help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
+        "policies that had it in all of their training)",
     )
     parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
@@ -154,6 +156,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
+        if options.filter is None:
+            options.filter = needs_filter(options.loaded)
         options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
         check_physics(options.physics)
         files.check_folder(options.output or output_folder(options))

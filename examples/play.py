@@ -22,7 +22,15 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from mpfa_envs import POLICIES, NavigationEnv, Policy, RobotModel, WorldTask, load_policy
+from mpfa_envs import (
+    POLICIES,
+    NavigationEnv,
+    Policy,
+    RobotModel,
+    TaskConfig,
+    WorldTask,
+    load_policy,
+)
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
 from training.evaluating import tasks_of
@@ -84,13 +92,14 @@ class Racer:
 def race(policy: Policy, episode: WorldTask, window: Window, **env_arguments: Any) -> Winner | None:
     """Drive one race; return the first at the goal, None if the player left."""
     arguments = {**policy.env_arguments, "contact": True, **env_arguments}
+    keep_off = TaskConfig(**arguments).make_filter()
     you, rival = Racer(episode, **arguments), Racer(episode, **arguments)
     with closing(you.env), closing(rival.env):
         while you.running or rival.running:
             if not window.show(picture_of(you, rival)) or "n" in window.pressed:
                 return None
             you.drive(action_of(window.keys, you.env.config.robot))
-            rival.drive(policy(rival.observation))
+            rival.drive(keep_off(rival.observation, policy(rival.observation)))
             # Whoever arrives ends the race for the other, unless both do in this step.
             if min(you.arrival, rival.arrival) < math.inf:
                 break

@@ -12,7 +12,7 @@ evaluations is pruned. It can be stopped or killed at any moment and continued b
 or with more ``--trials``: finished trials stay, and trials in progress resume from their last
 checkpoint.
 
-A trial of the default 50,000 actions takes some one and a half minutes of a core, one that is
+A trial of the default 30,000 actions takes some one and a half minutes of a core, one that is
 pruned at its third evaluation a third of that. The files in the folder:
 
     best.yaml    the best settings so far: train.py settings=runs/tune/best.yaml learner=td3

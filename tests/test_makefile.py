@@ -92,7 +92,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["demo"],
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
-                "[{world: mixed, actions: 40000}]",
+                "[{world: mixed, actions: 30000}]",
                 "python examples/evaluate.py runs/demo --worlds all --episodes 50",
                 "cd runs/demo/evaluation-all-",
                 "cp evaluation.json trajectories.png episode.gif ..",

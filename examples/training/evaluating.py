@@ -71,6 +71,11 @@ def filtered(policy: Policy | MapPlanner | DynamicWindow, **env_arguments: Any) 
     return Filtered(policy, TaskConfig(**policy.env_arguments | env_arguments).make_filter())
 
 
+def needs_filter(policy: Drivable) -> bool:
+    """Return True if a policy has never driven without the filter, as its card says."""
+    return bool(getattr(policy, "card", {}).get("filter", False))
+
+
 def tasks_of(
     policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
 ) -> list[WorldTask]:

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from mpfa_envs import (
     POLICIES,
     ROBOTS,
+    NavigationEnv,
     Policy,
     RobotModel,
     TaskConfig,
     VectorNavigationEnv,
+    World,
     evaluate,
     load_policy,
     make_planner,
@@ -303,3 +305,20 @@ def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
     assert policy.env_arguments.items() >= memory.items()
     results = evaluate(policy, "D", episodes=10, seed=4711, physics="kinematic")
     assert sum(found.success for found in results) >= 9
+
+
+@pytest.mark.parametrize(("name", "share"), [("td3-rooms", 0.99), ("ddpg-rooms", 0.97)])
+def test_a_policy_of_the_package_drives_at_full_speed_where_nothing_is_in_its_path(
+    name: str, share: float
+) -> None:
+    policy = load_policy(name)
+    hall = World(name="hall", size=(24.0, 8.0))
+    env = NavigationEnv(world=hall, contact=True, **policy.env_arguments)
+    seen, _ = env.reset(options={"start": (-10.0, 0.0, 0.0), "goal": (10.0, 0.0)})
+    done, speeds = False, []
+    while not done:
+        seen, _, done, _, info = env.step(policy(seen))
+        speeds.append(float(seen[env.config.observation_slices["linear_speed"]][0]))
+    env.close()
+    # In units of the wheels' limit; it speeds up at the start.
+    assert info["success"] and np.median(speeds) > share

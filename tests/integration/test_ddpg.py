@@ -27,7 +27,10 @@ def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("briefly")
 def test_a_trained_policy_drives_as_evaluate_drives_it(tmp_path: Path) -> None:
     policy = train(tmp_path)
-    assert policy.card == {"learner": "ddpg", "method": "mpfa_per", "seed": 0, "steps": 384}
+    assert policy.card == {
+        **{"learner": "ddpg", "method": "mpfa_per", "filter": True},
+        **{"seed": 0, "steps": 384},
+    }
     [driven] = drive(policy, ["A"], episodes=2, seed=0, physics=None, progress=False)
     assert len(driven.results) == 2
 

@@ -222,6 +222,23 @@ def test_the_table_has_the_score_of_barn_where_its_task_is_driven(
     assert "barn_score" not in document["worlds"]["A"]
 
 
+@pytest.mark.parametrize(
+    ("name", "words", "expected"),
+    [
+        ("td3-rooms", [], True),
+        ("td3-rooms", ["--no-filter"], False),
+        (SHIPPED, [], False),
+        (SHIPPED, ["--filter"], True),
+    ],
+)
+def test_a_policy_that_never_drove_without_the_filter_has_it_by_default(
+    name: str, words: list[str], expected: bool
+) -> None:
+    options = evaluate.parse([name, *words])
+    assert options.filter is expected
+    assert evaluate.output_folder(options).name.endswith("-filter") == expected
+
+
 def test_an_archive_of_barn_that_there_is_not_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -34,11 +34,17 @@ def exported_policy(
             "learner": settings.learner.name,
             "curriculum": settings.curriculum.name,
             "seed": settings.seed,
+            "filter": _always_filtered(settings),
             "episodes": episodes,
             "steps": steps,
         },
         env_arguments=env_arguments(settings.environment),
     )
+
+
+def _always_filtered(settings: TrainSettings) -> bool:
+    """Return True if a policy needs the filter: if all robots had it."""
+    return settings.environment.filter == 1.0 and not is_discrete(settings.learner)
 
 
 def kept_policy(run: TrainingRun) -> Policy:
@@ -72,9 +78,7 @@ def evaluate_policy(
     """
     start = time.perf_counter()
     wanted, exported = settings.evaluation, exported_policy(policy, settings)
-    # A policy of which some robots are without the filter is to be good without it.
-    always = settings.environment.filter == 1.0 and not is_discrete(settings.learner)
-    driver: Drivable = filtered(exported) if always else exported
+    driver: Drivable = filtered(exported) if _always_filtered(settings) else exported
     tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
     results = run_tasks(driver, tasks, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl", "sct")
