@@ -173,7 +173,12 @@ def missing_runs(rows: Rows) -> list[str]:
 
 
 def missing_table(runs: Sequence[str]) -> str:
-    """Return a table of runs, a line for each arm."""
+    """Return a table of runs, a line for each arm.
+
+    Examples:
+        >>> missing_table(["ddpg-per-103", "ddpg-per-104"]).splitlines()[-1]
+        '| ddpg-per | 103, 104 |'
+    """
     seeds: dict[str, list[str]] = {}
     for run in runs:
         arm, _, seed = run.rpartition("-")
