@@ -143,7 +143,9 @@ def test_the_task_of_an_archive_is_driven_and_scored(tmp_path: Path) -> None:
         )
     with pytest.warns(UserWarning, match="got one for 'kobuki' with robot='burger'"):
         slow = evaluate(policy, word, physics="kinematic", robot="burger")
-    assert all(each.barn_score in (0.0, 0.125) for each in slow)  # At 0.22 m/s.
+    # At 0.22 m/s, on paths that may be shorter than the reference.
+    scores = [each.barn_score or 0.0 for each in slow]
+    assert all(score == 0.0 or 0.125 <= score < 0.15 for score in scores)
     summary = summarize([*results, *evaluate(policy, "A", episodes=1, physics="kinematic")])
     assert summary["barn_score"].value == pytest.approx(
         np.mean([result.barn_score for result in results])

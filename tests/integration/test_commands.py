@@ -124,6 +124,7 @@ def test_every_command_on_the_pages_is_understood(
     best = tmp_path / "runs/tune/best.yaml"
     best.parent.mkdir(parents=True)
     best.write_text("learner.tau: 0.01\n")
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
     parse = argparse.ArgumentParser.parse_args
 
