@@ -58,7 +58,7 @@ help: ## Print this list
 
 demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unseen rooms
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off actions=$(DEMO_ACTIONS) $(ARGS)
 	@echo "== driving through test worlds of every generator"
 	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED) --filter
 	@cd runs/demo/evaluation-all-$(EVALUATED)-filter && cp evaluation.json trajectories.png episode.gif ..

@@ -2,6 +2,7 @@
 
     python examples/train.py                              MPFA-PER, 16 robots, new worlds
     python examples/train.py method=per seed=3            another method, another seed
+    python examples/train.py actions=5000                 a short run, of all robots together
     python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
     python examples/train.py regime=paper curriculum=A    only world A
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep, in hydra.sweep.dir

@@ -92,7 +92,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["demo"],
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
-                "[{world: mixed, actions: 30000}]",
+                "tracking=off actions=30000",
                 "python examples/evaluate.py runs/demo --worlds all --episodes 50",
                 "cd runs/demo/evaluation-all-",
                 "cp evaluation.json trajectories.png episode.gif ..",
@@ -100,7 +100,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
         ),
         (
             ["demo", "EPISODES=2", "DEMO_ACTIONS=900"],
-            ["[{world: mixed, actions: 900}]", "--worlds all --episodes 2"],
+            ["actions=900", "--worlds all --episodes 2"],
         ),
         (
             ["train", "ARGS=method=per seed=1"],

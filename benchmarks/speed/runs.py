@@ -18,7 +18,7 @@ from training.comparison.workers import LocalWorker
 SETTINGS = (
     *("regime=rooms", "learner.compile=true", "tracking=off"),
     *("evaluation.every=0", "evaluation.choose=false"),
-    "curriculum.stages=[{world: mixed, actions: 1600}]",
+    "actions=1600",
 )
 _WANTED = Evaluation(("test",), 4)
 _PAUSE = 0.01

@@ -19,14 +19,15 @@ def is_finished(folder: Path) -> bool:
 def after_the_end(folder: Path) -> str:
     """Return one sentence on what can be done with a finished run."""
     status = read_json(folder / files.STATUS)
-    stages = read_json(folder / files.SETTINGS).get("curriculum", {}).get("stages", [])
-    words = []
-    for number, stage in enumerate(stages):
-        unit = "actions" if stage["actions"] else "episodes"
-        # The last one twice as long, as an example.
-        length = stage[unit] * (2 if number == len(stages) - 1 else 1)
-        words.append(f"{{world: {stage['world']}, {unit}: {length}}}")
-    longer = f"'curriculum.stages=[{', '.join(words)}]'"
+    stages = read_json(folder / files.SETTINGS)["curriculum"]["stages"]
+    # Its last stage twice as long, as an example.
+    *fixed, last = stages
+    if last["actions"]:
+        longer = f"actions={sum(each['actions'] for each in stages) + last['actions']}"
+    else:
+        words = [f"{{world: {each['world']}, episodes: {each['episodes']}}}" for each in fixed]
+        words.append(f"{{world: {last['world']}, episodes: {2 * last['episodes']}}}")
+        longer = f"'curriculum.stages=[{', '.join(words)}]'"
     return (
         f"{folder} is finished, after {status['done']:,} {status['unit']}s: evaluate it with "
         f"evaluate.py {folder}, or train on with train.py resume={folder} {longer}"

@@ -240,6 +240,20 @@ def test_a_bad_argument_is_named_with_its_value(
         make(**arguments)
 
 
+@pytest.mark.parametrize("make", [one, many, torchrl])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("num_env", "^unknown argument 'num_env': did you mean 'num_envs'"),
+        ("max_episode_steps", "^unknown argument .*: did you mean 'max_steps'"),
+        ("wrong", "^unknown argument 'wrong'$"),
+    ],
+)
+def test_an_unknown_argument_is_rejected_with_the_nearest(make, name, message) -> None:
+    with pytest.raises(TypeError, match=message):
+        make(**{name: 2})
+
+
 def of_a_policy(**env_arguments: Any) -> object:
     """The evaluation of a policy whose file asks for these arguments."""
     return evaluate(make_policy(**env_arguments), "A", episodes=1, physics="kinematic")

@@ -203,6 +203,7 @@ DRIVEN: Rows = [
         partial(evaluated, envs_at_once=1.5),
         "envs_at_once must be a positive integer, got 1.5",
     ),
+    (partial(world_tasks, "maze:test"), "NAME:test .*got 'maze:test' .did you mean 'mazes'"),
     (partial(evaluated, world="tets"), "world must be .*did you mean 'test'"),
     (partial(evaluated, world=["A", "tets"]), "world must be .*did you mean 'test'"),
     (partial(evaluated, physics="magic"), "physics must be one of .*got 'magic'"),

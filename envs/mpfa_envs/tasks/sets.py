@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any, Final, NamedTuple, cast, get_args
 
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_count, did_you_mean
 from mpfa_envs.generators.generate import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.model import RobotModel
@@ -102,8 +102,13 @@ def world_tasks(
                 for world, length in islice(worlds, episodes)
             ]
         )
-    if isinstance(name, str) and name.partition(":")[0] in GENERATORS:
-        generator, _, split = name.partition(":")
+    generator, _, split = str(name).partition(":")
+    if split in get_args(Split)[1:] and generator not in GENERATORS:
+        hint = f" ({question})" if (question := did_you_mean(generator, GENERATORS)) else ""
+        raise ValueError(
+            f"world must be NAME:{split} with a NAME of {list(GENERATORS)}, got {name!r}{hint}"
+        )
+    if isinstance(name, str) and generator in GENERATORS:
         if split not in get_args(Split)[1:]:
             raise ValueError(
                 f"world must be {generator}:validation or {generator}:test to stand for tasks in "

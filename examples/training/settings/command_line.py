@@ -139,5 +139,6 @@ def _nearest(word: str, known: Iterable[str]) -> str:
     names = list(known)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     inside = [name for name in names if name.split(".")[-1] == word.split(".")[-1]]
-    found = inside[:1] or near
-    return f": did you mean {found[0]!r}?" if found else ""
+    typo = difflib.get_close_matches(word, [n for n in names if "." not in n], n=1, cutoff=0.8)
+    found = dict.fromkeys([*typo, *inside[:1]] or near)
+    return f": did you mean {' or '.join(map(repr, found))}?" if found else ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +60,25 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
             config[key] = OmegaConf.merge(*chosen, REGIMES[before.regime].get(key, {}))
         else:
             OmegaConf.update(config, key, value)
+    if config.actions is not None:
+        config.curriculum.stages = _lengthened(before.curriculum.stages, config.actions)
+        config.actions = None
     was_derived = before.curriculum.name == curriculum_name(before.curriculum.stages)
     named = any(override.key_or_group == "curriculum.name" for override in overrides)
     if was_derived and not named:
         config.curriculum.name = None
     return as_settings(config)
+
+
+def _lengthened(stages: Sequence[Stage], actions: int) -> list[Stage]:
+    """Return stages of so many actions in all, of which the last stage has what is left."""
+    *fixed, last = stages
+    if not last.actions:
+        raise ValueError(
+            "resume: actions must be null in a run that counts episodes, got "
+            f"{actions}: lengthen the last of its curriculum.stages"
+        )
+    return [*fixed, replace(last, actions=actions - sum(each.actions for each in fixed))]
 
 
 def check_single(overrides: list[Override]) -> None:

@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,28 @@ class Stage:
     def length(self) -> int:
         """Episodes or actions, whichever it counts."""
         return self.episodes or self.actions
+
+
+def sized(stages: Sequence[Stage], actions: int) -> list[Stage]:
+    """Return stages that count actions, in the proportion of their lengths.
+
+    Args:
+        stages: The stages, which count episodes or actions; without a length each counts as 1.
+        actions: Actions of all robots in all stages.
+
+    Raises:
+        ValueError: If a stage would have no action.
+
+    Examples:
+        >>> [each.actions for each in sized([Stage("A", episodes=100), Stage("B", 200)], 6_000)]
+        [2000, 4000]
+    """
+    so_far = list(accumulate(stage.length or 1 for stage in stages))
+    ends = [actions * each // so_far[-1] for each in so_far]
+    lengths = [end - begin for begin, end in pairwise([0, *ends])]
+    if any(length < 1 for length in lengths):
+        raise ValueError(f"actions must leave each stage at least 1, got {actions}")
+    return [Stage(each.world, actions=n) for each, n in zip(stages, lengths, strict=True)]
 
 
 @dataclass
@@ -210,7 +233,7 @@ class TrainSettings:
         }
     )
     run_dir: str = setting(
-        "runs/${curriculum_name:${curriculum.name},${curriculum.stages}}"
+        "runs/${curriculum_name:${curriculum.name},${curriculum.stages},${actions}}"
         "-${method.name}-${learner.name}-${seed}",
         WORD,
     )
@@ -229,6 +252,9 @@ class TrainSettings:
     resume: str | None = None
     """Folder of a run to continue, with its own settings. More episodes, tracking and how
     often to evaluate and to save may be changed; anything else is rejected."""
+    actions: int | None = setting(None, at_least(1))
+    """Length of the run: actions of all robots in all stages, which share them in the proportion of
+    their lengths, also where these count episodes; null: as ``curriculum.stages`` says."""
     checkpoint_every: int = setting(10_000, at_least(1))
     """Actions between two checkpoints."""
     robots: int = setting(1, up_to(MOST_ROBOTS, why=", as a robot takes up to 1.6 MB of memory"))
@@ -344,8 +370,13 @@ def register() -> None:
             store.store(group=group, name=name, node=node, package=package)
 
 
-def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
-    return name or curriculum_name([Stage(s.world, s.episodes, s.actions) for s in stages])
+def _resolve_name(name: str | None, stages: Sequence[Any], actions: int | None) -> str:
+    made = _plain(stages)
+    return name or curriculum_name(sized(made, actions) if actions else made)
+
+
+def _plain(stages: Sequence[Any]) -> list[Stage]:
+    return [Stage(each.world, each.episodes, each.actions) for each in stages]
 
 
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
@@ -360,6 +391,10 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         structure.method = method_named(values.method.name)
     merged = OmegaConf.merge(structure, values)
     merged.pop("hydra", None)
+    if merged.actions is not None:
+        # From here on the stages alone say how long the run is.
+        merged.curriculum.stages = sized(_plain(merged.curriculum.stages), merged.actions)
+        merged.actions = None
     # A method checks its own settings.
     with named("method."):
         settings = OmegaConf.to_object(merged)

@@ -22,6 +22,7 @@ from tests.integration.tiny_runs import train as train_tiny
 from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
+from training.finished import after_the_end
 from training.records import read_table
 from training.run import checkpoints, hooks
 from training.run.checkpoints import read_checkpoint, save
@@ -170,6 +171,19 @@ def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_the_actions_of_a_resumed_run_lengthen_its_last_stage(tmp_path: Path) -> None:
+    stages = "curriculum.stages=[{world: A}, {world: B}]"
+    (settings,) = composed([*OVERRIDES, stages, "actions=30"])
+    assert start(settings, tmp_path) == 0
+    assert "actions=45" in after_the_end(tmp_path)
+    assert go_on(tmp_path, "actions=45") == 0
+    found = json.loads((tmp_path / files.SETTINGS).read_text())["curriculum"]["stages"]
+    assert [(stage["world"], stage["actions"]) for stage in found] == [("A", 15), ("B", 30)]
+    assert json.loads((tmp_path / files.STATUS).read_text())["steps"] == 45
+    with pytest.raises(Rejected, match=r"has \[A: 15, B: 30\], got \[A: 15, B: 25\]"):
+        go_on(tmp_path, "actions=40")
+
+
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
 def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: str) -> None:
     words = ["regime=rooms", f"learner={learner}", "curriculum=rooms", "method=per"]
@@ -187,6 +201,7 @@ def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: s
         ("regime=rooms", r"cannot change regime=rooms \(it has paper\)"),
         ("robots=4", r"cannot change robots=4 \(it has 1\)"),
         (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
+        ("actions=900", "actions must be null in a run that counts episodes, got 900"),
         ("run_dir=elsewhere", "resume: run_dir has no effect, a run resumes in its folder"),
         ("overwrite=true", "resume: overwrite has no effect"),
         # Sums over two threads have other last bits.

@@ -211,11 +211,51 @@ def test_long_curricula_that_differ_have_short_names_that_differ() -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "stages"),
+    [
+        (["actions=7000"], [Stage("mixed", actions=7_000)]),
+        (["actions=7000", "curriculum.stages=[{world: bars}]"], [Stage("bars", actions=7_000)]),
+        (
+            ["actions=1000", "regime=paper"],
+            [
+                Stage(world, actions=n)
+                for world, n in zip("ABCD", (100, 200, 300, 400), strict=True)
+            ],
+        ),
+        (
+            ["actions=10", "curriculum.stages=[{world: A, actions: 2}, {world: B, actions: 1}]"],
+            [Stage("A", actions=6), Stage("B", actions=4)],
+        ),
+    ],
+)
+def test_stages_share_the_actions_of_a_run_in_proportion(words, stages) -> None:
+    [settings] = composed(words)
+    assert settings.curriculum.stages == stages
+    assert settings.curriculum.name == curriculum_name(stages)
+    assert f"/{curriculum_name(stages)}-" in settings.run_dir
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["actions=3", "regime=paper"], "actions must leave each stage at least 1, got 3"),
+        (["actions=0"], "actions must leave each stage at least 1, got 0"),
+        (["actions=many"], "actions: Value 'many'"),
+        (["actions=9", "curriculum.stages=[]"], "curriculum.stages must name at least one world"),
+    ],
+)
+def test_a_length_that_a_run_cannot_have_is_rejected(words, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        list(composed(words))
+
+
+@pytest.mark.parametrize(
     ("argument", "message"),
     [
         ("sede=1", r"unknown setting 'sede': did you mean 'seed'\?"),
         ("learner.widht=64", r"unknown setting 'learner.widht': did you mean 'learner.width'\?"),
         ("alpha=0.5", r"unknown setting 'alpha': did you mean 'method.alpha'\?"),
+        ("robot=16", r"'robot': did you mean 'robots' or 'environment.robot'\?"),
         ("method=prr", r"unknown choice 'prr' of 'method': did you mean 'per'\?"),
         ("+extra=1", r"unknown setting 'extra'"),
     ],
