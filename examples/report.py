@@ -1,13 +1,19 @@
-"""Make tables and a figure of comparisons, from the rows that ``compare.py`` kept; trains nothing.
+"""Make tables and a figure of many runs, with intervals and tests; trains nothing.
 
     python examples/report.py runs/compare
     python examples/report.py runs/compare runs/more    the runs of both together
+    python examples/report.py scores.csv                scores that any script wrote
+    python examples/report.py runs/mine                 all such tables in a folder
 
-It writes ``tables.md`` and ``evaluations.png``, greedy success in the validation world over actions
-(the training of each run has a ``learning_curve.png`` in its folder). Each arm has a row and a line
-(``compare.py --arm``); each kind of worlds, and evaluations with other physics, have tables of
-their own: success, its interval and that of each run, and the differences between arms with their
-intervals and p. The unit is the run, not the episode: see ``training/comparison/report.py``.
+Of comparisons of ``compare.py`` it writes ``tables.md`` and ``evaluations.png``, greedy success in
+the validation world over actions (each run has its ``learning_curve.png``). Each arm has a row and
+a line (``compare.py --arm``); each kind of worlds, and evaluations with other physics, have tables
+of their own: success, its interval and that of each run, and the differences between arms with
+their intervals and p.
+
+A table of scores is a CSV file with the columns task, method, seed, steps and score: a row for each
+evaluation of each run, of which a higher score is better. Of these it writes ``tables.md`` and
+``curves.png``. The unit is the run, not the episode.
 """
 
 from __future__ import annotations
@@ -21,6 +27,7 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training.comparison.report import write_report
+from training.comparison.scores import CURVES, are_scores, write_scores
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,17 +42,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folders", type=Path, nargs="+", help="folders of comparisons")
-    parser.add_argument("--output", type=Path, help="folder (default: the first comparison's)")
+    parser.add_argument(
+        "paths", type=Path, nargs="+", help="folders of comparisons, or tables of scores"
+    )
+    parser.add_argument("--output", type=Path, help="folder (default: that of the first path)")
     options = parser.parse_args(arguments)
-    there = [folder.resolve() for folder in options.folders]
-    for folder, path in zip(options.folders, there, strict=True):
+    there = [path.resolve() for path in options.paths]
+    for given, path in zip(options.paths, there, strict=True):
         if there.count(path) > 1:
-            parser.error(f"{folder} is named twice: its runs count once")
+            parser.error(f"{given} is named twice: its runs count once")
+        if not path.exists():
+            parser.error(f"there is no {given}")
+    kinds = {are_scores(path) for path in options.paths}
+    if len(kinds) > 1:
+        parser.error("comparisons and tables of scores have reports of their own: name one kind")
+    first = options.paths[0]
+    output = options.output or (first.parent if first.is_file() else first)
+    write = write_scores if kinds == {True} else write_report
     try:
-        print(write_report(options.folders, options.output or options.folders[0]))
+        print(write(options.paths, output))
     except ValueError as error:
         parser.error(" ".join(str(error).split()))
+    picture = CURVES if kinds == {True} else "evaluations.png"
+    made = [output / name for name in ("tables.md", picture) if (output / name).exists()]
+    print(f"written: {', '.join(map(str, made))}")
     return 0
 
 

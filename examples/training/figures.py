@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from mpfa_envs.render.charts import finish, look, new_figure, plot_seeds
+from mpfa_envs.render.charts import Curve, draw_seeds, finish, look, new_figure, plot_seeds
 
 Runs = Mapping[str, Mapping[str, pd.DataFrame]]
 """Tables by the name of their arm, then of their run."""
@@ -47,6 +47,27 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
     few = max(map(len, curves.values())) < _SPREAD
     ylabel = "greedy success in the validation world"
     plot_seeds(curves, path, ylabel=ylabel, band="runs" if few else "interval")
+
+
+def plot_scores(tasks: Mapping[str, Mapping[str, Mapping[str, Curve]]], path: Path) -> None:
+    """Plot the curves of each task in a panel of its own, a method in the same color in all.
+
+    Args:
+        tasks: Curves by task, method and run.
+        path: The PNG file.
+    """
+    methods = dict.fromkeys(method for runs in tasks.values() for method in runs)
+    places = {method: number for number, method in enumerate(methods)}
+    columns = min(len(tasks), 3)
+    figure, axes = new_figure(-(-len(tasks) // columns), columns, panel=(5.0, 3.6))
+    for axis, (task, runs) in zip(axes, tasks.items(), strict=False):
+        curves = {method: list(each.values()) for method, each in runs.items()}
+        few = max(map(len, curves.values())) < _SPREAD
+        draw_seeds(axis, curves, band="runs" if few else "interval", places=places)
+        axis.set(xlabel="steps", ylabel="score", title=task)
+    for axis in axes[len(tasks) :]:
+        axis.remove()
+    finish(figure, axes[: len(tasks)], path)
 
 
 def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:

@@ -7,6 +7,8 @@ decides many of them. So each run counts as one number.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,12 @@ from mpfa_envs.evaluation.results import Interval
 Array = NDArray[np.float64]
 _PERMUTATIONS = 50_000
 """Permutations: all of them up to nine runs against nine or fifteen pairs, else a sample."""
+
+
+FEWEST = 3
+"""Fewest runs with an interval: that of two runs would be 13 times as wide as their distance."""
+_PAIRED = 6
+"""Fewest pairs whose test can give a p below 0.05."""
 
 
 def mean_interval(runs: Array) -> Interval:
@@ -82,6 +90,43 @@ def sign_p(gaps: Array) -> float:
         return np.asarray(abs(x.mean(axis=axis)).round(12))
 
     return _share((gaps,), size, permutation_type="samples")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The difference of two means of runs, and its test."""
+
+    gap: Interval
+    """Difference with its 95 % interval; ends are NaN for fewer than three runs a side."""
+    p: float
+    least: float
+    """Least p that so few runs can have."""
+
+
+def permuted_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Difference:
+    """Test the difference of two means by permutations.
+
+    Runs are paired by name where both sides have the same six runs or more.
+
+    Args:
+        ours: The value of each run by its name, as a rule its seed.
+        theirs: The values of other runs.
+
+    Examples:
+        >>> found = permuted_difference({"0": 1.0, "1": 2.0}, {"0": 3.0, "1": 4.0})
+        >>> found.gap.value, round(found.p, 3), round(found.least, 3)
+        (-2.0, 0.333, 0.333)
+    """
+    if ours.keys() == theirs.keys() and len(ours) >= _PAIRED:
+        gaps = np.array([ours[name] - theirs[name] for name in ours])
+        return Difference(mean_interval(gaps), sign_p(gaps), 0.5 ** (len(gaps) - 1))
+    a, b = (np.array(list(each.values())) for each in (ours, theirs))
+    gap = difference_interval(a, b)
+    if min(len(a), len(b)) < FEWEST:
+        gap = Interval(gap.value, math.nan, math.nan)
+    # Of two groups of one size, each arrangement has a mirror image with the same difference.
+    least = (1 + (len(a) == len(b))) / math.comb(len(a) + len(b), len(a))
+    return Difference(gap, permutation_p(a, b), least)
 
 
 def _share(samples: tuple[Array, ...], statistic: Any, **options: Any) -> float:

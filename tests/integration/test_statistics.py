@@ -14,8 +14,17 @@ from training.statistics import (
     holm,
     mean_interval,
     permutation_p,
+    permuted_difference,
     sign_p,
 )
+
+
+def test_the_least_p_is_that_of_runs_that_differ_as_much_as_they_can() -> None:
+    for ours, theirs in ((2, 2), (2, 3), (1, 4), (6, 6)):
+        a = {str(n): float(n) for n in range(ours)}
+        b = {str(n): 100.0 + n for n in range(theirs)}
+        found = permuted_difference(a, b)
+        assert found.p == pytest.approx(found.least)
 
 
 def test_mean_interval_covers_the_mean_of_normal_runs_at_its_level() -> None:

@@ -7,24 +7,31 @@ around a bar decides many of them. Intervals and tests are of the means of runs.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from mpfa_envs.evaluation.results import Interval
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.jobs import run_name
 from training.figures import Runs, plot_evaluations
 from training.records import read_table
-from training.statistics import Array, difference_interval, mean_interval, permutation_p
+from training.statistics import FEWEST, Array, holm, mean_interval, permuted_difference
 from training.worlds import family
 
 RATES = (0.9, 0.95)
 """Rates of greedy success in validation of which the time until then is reported."""
 ARM = ("learner", "method", "arm")
+HOW_TO_READ = """\
+The unit is the run: each run counts as one number. *95 %* is Student's interval of a mean, Welch's
+of a difference. *p* is that of a two-sided permutation test, corrected for the rows of its table by
+Holm's method; runs are paired by seed where both arms have the same six seeds or more. *Least* is
+the smallest p that so few runs can have. In a figure, a number in brackets counts runs."""
 
 
 def write_report(folders: Sequence[Path], output: Path) -> str:
@@ -43,10 +50,11 @@ def write_report(folders: Sequence[Path], output: Path) -> str:
     files.check_folder(output)
     rows = read_comparisons(folders)
     evaluations = tables_of_runs(rows, files.EVALUATIONS)
-    parts = sections(rows)
+    parts = [HOW_TO_READ, *sections(rows)]
     output.mkdir(parents=True, exist_ok=True)
     if evaluations:
-        parts += ["## Evaluations during training", rate_table(evaluations)]
+        picture = "![Greedy success in the validation world over actions](evaluations.png)"
+        parts += ["## Evaluations during training", rate_table(evaluations), picture]
         plot_evaluations(evaluations, output / "evaluations.png")
     text = "\n\n".join(part for part in parts if part)
     write_text_atomically(text + "\n", output / "tables.md")
@@ -148,7 +156,7 @@ def outcomes(rows: pd.DataFrame) -> str:
             [
                 *cells(str(arm), width),
                 f"{success.mean():.1%}",
-                _interval(success.mean(axis=1)),
+                _share_interval(success.mean(axis=1)),
                 ", ".join(f"{value:.1%}" for value in success.mean(axis=1)),
                 *rates,
                 f"{scores(found, 'spl').mean():.3f}",
@@ -180,16 +188,51 @@ def success_table(rows: pd.DataFrame) -> str:
 def differences(rows: pd.DataFrame) -> str:
     """Return a table of the differences between arms, tested over runs; empty for one arm."""
     arms = {str(arm): found for arm, found in rows.groupby("arm", sort=False)}
-    lines = []
-    for a, b in combinations(arms, 2):
-        line = [f"{a} − {b}"]
-        for column in ("success", "spl"):
-            ours, theirs = (scores(arms[name], column).mean(axis=1) for name in (a, b))
-            gap = f"{ours.mean() - theirs.mean():+.3f}"
-            line += [gap, _interval(ours, theirs), f"{permutation_p(ours, theirs):.3f}"]
-        lines.append(line)
-    head = ["", "success", "95 %", "p", "SPL", "95 %", "p"]
-    return table(head, lines) if lines else ""
+    names = {"success": "success", "SPL": "spl"}
+    return difference_table(
+        {
+            name: {arm: _of_runs(found, column) for arm, found in arms.items()}
+            for name, column in names.items()
+        }
+    )
+
+
+def difference_table(values: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    """Return a table of the differences between arms; empty for one arm.
+
+    Args:
+        values: The value of each run, by quantity, arm and run.
+    """
+    arms = list(next(iter(values.values())))
+    pairs = list(combinations(arms, 2))
+    if not pairs:
+        return ""
+    signed = partial(number, sign=True)
+    columns: list[list[str]] = [[f"{a} − {b}" for a, b in pairs]]
+    for of_arms in values.values():
+        found = [permuted_difference(of_arms[a], of_arms[b]) for a, b in pairs]
+        corrected = holm(np.array([each.p for each in found]))
+        sides = [[np.array(list(of_arms[name].values())) for name in pair] for pair in pairs]
+        columns += [
+            [number(each.gap.value, sign=True) for each in found],
+            [interval(each.gap, runs, signed) for each, runs in zip(found, sides, strict=True)],
+            [
+                _p(p, min(len(pairs) * each.least, 1.0))
+                for p, each in zip(corrected, found, strict=True)
+            ],
+        ]
+    head = [word for name in values for word in (name, "95 %", "p")]
+    return table(["", *head], list(zip(*columns, strict=True)))
+
+
+def number(value: float, *, sign: bool = False) -> str:
+    """Return a number with three decimals, a large one with one."""
+    return f"{value:{'+' if sign else ''}.{3 if abs(value) < 100 else 1}f}"
+
+
+def _p(corrected: float, least: float) -> str:
+    """Return p, and the least that so few runs can have where no difference could be found."""
+    return f"{corrected:.3f}" + (f" (least {least:.3f})" if least > 0.05 else "")
 
 
 def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
@@ -236,20 +279,33 @@ def cells(arm: str, width: int) -> list[str]:
     return [*arm.split("/"), *[""] * width][:width]
 
 
-def _interval(ours: Array, theirs: Array | None = None) -> str:
-    """Student's 95 % interval of a mean of runs, or Welch's of a difference of two."""
-    sides = [ours] if theirs is None else [ours, theirs]
-    if min(map(len, sides)) < 2:
-        return "one run"
+def interval(found: Interval, runs: Sequence[Array], form: Callable[[float], str]) -> str:
+    """Return a 95 % interval, or in words why there is none.
+
+    Args:
+        found: The interval.
+        runs: Values of the runs of one arm, or of each of two.
+        form: Function that writes an end.
+    """
+    fewest = min(map(len, runs))
+    if fewest < FEWEST:
+        return "one run" if fewest == 1 else "two runs: no interval"
     # Runs that all end alike, at 0 % or 100 % as a rule, do not show how much others differ.
-    if not any(np.ptp(each) for each in sides):
+    if not any(np.ptp(each) for each in runs):
         return "none, no spread"
-    if theirs is None:
-        found = mean_interval(ours)
-        # A share lies in no other part of it.
-        return f"[{max(found.low, 0.0):.1%}, {min(found.high, 1.0):.1%}]"
-    found = difference_interval(ours, theirs)
-    return f"[{found.low:+.3f}, {found.high:+.3f}]"
+    return f"[{form(found.low)}, {form(found.high)}]"
+
+
+def _share_interval(runs: Array) -> str:
+    """Return Student's interval of the mean of shares, which lies within 0 and 1."""
+    found = mean_interval(runs)
+    return interval(found, [runs], lambda end: f"{min(max(end, 0.0), 1.0):.1%}")
+
+
+def _of_runs(rows: pd.DataFrame, column: str) -> dict[str, float]:
+    """Return the mean of a column for each run, by the name of the run."""
+    names = map(str, rows["run"].unique())
+    return dict(zip(names, scores(rows, column).mean(axis=1).tolist(), strict=True))
 
 
 def _first(found: pd.DataFrame, rate: float, column: str) -> float:

@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 import report
-from training.comparison.report import read_comparisons
+from training.comparison.report import HOW_TO_READ, read_comparisons
 from training.records import write_table
 
-LINE = "| ddpg | mpfa_per | 87.5% | [0.0%, 100.0%] | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |"
+TWO = "two runs: no interval"
+LINE = f"| ddpg | mpfa_per | 87.5% | {TWO} | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |"
 NO = "none, no spread"
 
 
@@ -22,13 +23,14 @@ def test_the_tables_say_what_the_rows_say(
 ) -> None:
     assert report.main([str(comparison)]) == 0
     text = (comparison / "tables.md").read_text(encoding="utf-8")
-    assert text.strip() == capsys.readouterr().out.strip()
+    made = f"{comparison}/tables.md, {comparison}/evaluations.png"
+    assert capsys.readouterr().out == f"{text}written: {made}\n"
+    assert "(evaluations.png)" in text and HOW_TO_READ in text
     # Seven of eight pairs, of which four took 20 s and three 21 s.
     assert LINE in text
-    # Two runs at zero say nothing of how far others are from it.
-    assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0% | 100.0% | 0.0% | 0.000 |  |" in text
+    assert f"| ddpg | per | 0.0% | {TWO} | 0.0%, 0.0% | 100.0% | 0.0% | 0.000 |  |" in text
     # Two runs against two: six ways to deal them out, two of which differ as much.
-    assert "| ddpg/mpfa_per − ddpg/per | +0.875 | [-0.713, +2.463] | 0.333 |" in text
+    assert f"| ddpg/mpfa_per − ddpg/per | +0.875 | {TWO} | 0.333 (least 0.333) |" in text
     with Image.open(comparison / "evaluations.png") as picture:
         assert picture.width == 840
 
@@ -117,6 +119,7 @@ def test_two_comparisons_of_one_name_have_the_runs_of_both(
         write_table(rows, folder / "episodes.csv")
     assert report.main([*map(str, folders), "--output", str(tmp_path / "both")]) == 0
     text = (tmp_path / "both" / "tables.md").read_text("utf-8")
+    # Four runs at zero say nothing of how far others are from it.
     assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0%, 0.0%, 0.0% |" in text
     assert set(read_comparisons(folders)["run"]) == {f"{f}/{n}" for f in folders for n in (0, 1)}
     assert set(read_comparisons([comparison, folders[0]])["run"]) == {

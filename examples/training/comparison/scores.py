@@ -1,0 +1,134 @@
+"""Tables and curves of scores that any script wrote: rows of task, method, seed, steps, score."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from mpfa_envs.render.charts import Curve
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.report import HOW_TO_READ, difference_table, interval, number, table
+from training.figures import plot_scores
+from training.records import read_table
+from training.statistics import mean_interval
+
+COLUMNS = ("task", "method", "seed", "steps", "score")
+CURVES = "curves.png"
+Runs = dict[str, dict[str, Curve]]
+"""Curves of the runs of a task, by method and seed."""
+
+
+def are_scores(path: Path) -> bool:
+    """Return True unless a path is the folder of a comparison of ``compare.py``."""
+    return path.is_file() or not (path / files.EPISODES).exists()
+
+
+def write_scores(paths: Sequence[Path], output: Path) -> str:
+    """Write ``tables.md`` and ``curves.png``.
+
+    Args:
+        paths: Tables of scores, or folders of such tables.
+        output: Folder of the two files.
+
+    Returns:
+        The tables.
+
+    Raises:
+        ValueError: If there are no scores, a table is damaged, or the output is no folder.
+    """
+    files.check_folder(output)
+    tasks = {str(task): runs_of(found) for task, found in read_scores(paths).groupby("task")}
+    parts = [HOW_TO_READ]
+    for task, runs in tasks.items():
+        parts += [f"## {task}", *score_tables(runs)]
+    parts.append(f"![Scores over steps: mean of the runs]({CURVES})")
+    plot_scores(tasks, output / CURVES)
+    text = "\n\n".join(part for part in parts if part)
+    write_text_atomically(text + "\n", output / "tables.md")
+    return text
+
+
+def read_scores(paths: Sequence[Path]) -> pd.DataFrame:
+    """Read tables of scores: files, or all in folders that have their columns."""
+    tables = []
+    for path in paths:
+        found = [path] if path.is_file() else sorted(path.rglob("*.csv"))
+        for file in found:
+            rows = read_table(file)
+            missing = [name for name in COLUMNS if name not in rows]
+            if not missing and len(rows):
+                tables.append(_checked(rows[list(COLUMNS)].copy(), file))
+            elif missing and path.is_file():
+                raise ValueError(f"{file} must have the columns {', '.join(COLUMNS)}: no {missing}")
+    if not tables:
+        names = ", ".join(map(str, paths))
+        raise ValueError(f"{names}: no table with the columns {', '.join(COLUMNS)} and a row")
+    rows = pd.concat(tables, ignore_index=True)
+    twice = rows[rows.duplicated(["task", "method", "seed", "steps"])]
+    if len(twice):
+        one = ", ".join(f"{name} {twice.iloc[0][name]}" for name in COLUMNS[:-1])
+        raise ValueError(f"a run must have one score at each step, got two of {one}")
+    return rows
+
+
+def _checked(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
+    """Return the rows with steps and scores as numbers; raise where they are none."""
+    for name in ("steps", "score"):
+        rows[name] = pd.to_numeric(rows[name], errors="coerce").astype(float)
+        if not np.isfinite(rows[name]).all():
+            line = int(np.flatnonzero(~np.isfinite(rows[name]))[0]) + 2
+            raise ValueError(f"{file}:{line}: {name} must be a finite number")
+    for name in ("task", "method", "seed"):
+        rows[name] = rows[name].astype(str)
+    return rows
+
+
+def runs_of(rows: pd.DataFrame) -> Runs:
+    """Return the curves of one task, in the order of the rows."""
+    runs: Runs = {}
+    for (method, seed), found in rows.groupby(["method", "seed"], sort=False):
+        found = found.sort_values("steps")
+        curve = found["steps"].to_numpy(), found["score"].to_numpy()
+        runs.setdefault(str(method), {})[str(seed)] = curve
+    return runs
+
+
+def score_tables(runs: Runs) -> list[str]:
+    """Return what the columns are, a table of the methods, and one of their differences."""
+    curves = [curve for of_method in runs.values() for curve in of_method.values()]
+    begin = max(steps[0] for steps, _ in curves)
+    end = min(steps[-1] for steps, _ in curves)
+    if end < begin:
+        raise ValueError(f"runs must have steps in common, got one to {end:g}, one from {begin:g}")
+    last, mean = f"score at {end:,.0f} steps", "mean of the curve"
+    values = {
+        name: {
+            method: {seed: height(curve, first, end) for seed, curve in of_method.items()}
+            for method, of_method in runs.items()
+        }
+        for name, first in ((last, end), (mean, begin))
+    }
+    lines = []
+    for method in runs:
+        line = [method]
+        for name in (last, mean):
+            found = np.array(list(values[name][method].values()))
+            middle = mean_interval(found)
+            line += [number(middle.value), interval(middle, [found], number)]
+        lines.append([*line, ", ".join(map(number, values[last][method].values()))])
+    head = ["method", last, "95 %", mean, "95 %", "score of each run"]
+    why = "Runs are compared up to the last step that all of them have."
+    return [why, table(head, lines), difference_table(values)]
+
+
+def height(curve: Curve, begin: float, end: float) -> float:
+    """Return the mean height of a curve between two steps; its height where they are one."""
+    steps, scores = curve
+    inside = steps[(steps > begin) & (steps < end)]
+    x = np.array([begin, *inside, end])
+    y = np.interp(x, steps, scores)
+    return float(y[-1] if begin == end else np.trapezoid(y, x) / (end - begin))
