@@ -6,6 +6,7 @@
     python examples/compare.py --physics wheels --filter  evaluated on wheels, behind the filter
     python examples/compare.py --arm default: --arm phi2:method.boost_factor=2    two arms of each
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
+    python examples/compare.py --plugin mine.py --methods mine per    a method of your own
     python examples/compare.py --ray HEAD:6379            on all machines of a Ray cluster
 
 A run of the default 30,000 actions, with its evaluation, takes some one and a half minutes of a
@@ -41,6 +42,7 @@ from training.comparison.arms import check_free, parse_arms
 from training.comparison.execution import add_options, make_runs
 from training.comparison.jobs import TESTED, Comparison, Evaluation
 from training.environments import check_physics
+from training.plugins import add_plugin, with_plugin
 from training.settings.train import GROUPS, register
 from training.worlds import parse_worlds
 
@@ -73,10 +75,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar="NAME:SETTING=VALUE,...",
         help="a name and its settings, added to every run; may be given several times",
     )
+    add_plugin(parser)
     parser.add_argument("--anew", action="store_true", help="train runs with other settings again")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
     try:
+        options.overrides, options.plugin = with_plugin(options.overrides, options.plugin)
         check_free(options.overrides)
         options.arms = parse_arms(options.arm)
         check_physics(options.physics or "kinematic")
@@ -123,7 +127,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.seeds,
         tuple(options.learners),
         tuple(options.arms),
-        Evaluation(tuple(options.worlds), options.episodes, options.physics, options.filter),
+        Evaluation(
+            tuple(options.worlds), options.episodes, options.physics, options.filter, options.plugin
+        ),
     )
     try:
         status = make_runs(comparison, most=options.jobs, ray=options.ray, anew=options.anew)

@@ -61,6 +61,7 @@ from training.evaluating import (
 )
 from training.live import watch
 from training.pictures import Values, write_pictures
+from training.plugins import add_plugin
 from training.records import as_table, write_table
 from training.run.values import load_learner, values_of
 from training.worlds import parse_worlds, world_name
@@ -138,6 +139,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
         "policies that had it in all of their training)",
     )
+    add_plugin(parser)
     parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
     )

@@ -38,6 +38,7 @@ import training.extra  # noqa: F401
 # isort: split
 from training import files
 from training.comparison.execution import add_options
+from training.plugins import add_plugin, with_plugin
 from training.settings.train import register
 
 RANGES = Path(__file__).with_suffix(".yaml")
@@ -68,6 +69,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default="area",
         help="area under the curve of success, or success of the last policy (default: area)",
     )
+    add_plugin(parser)
     parser.add_argument("--sampler-seed", type=int, default=0, help="of what is suggested")
     add_options(parser, folder="runs/tune", what="trials")
     options = parser.parse_args(arguments)
@@ -83,8 +85,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     # Imports Optuna, an extra of its own.
     from training.comparison.ranges import read_ranges
 
-    register()
     try:
+        options.settings, _ = with_plugin(options.settings, options.plugin)
+        register()
         files.check_folder(options.folder)
         options.searched = read_ranges(options.ranges, options.settings)
     except ValueError as error:

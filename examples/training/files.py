@@ -39,6 +39,11 @@ def digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+def digest_of(plugin: str | None) -> str | None:
+    """Return the digest of a plugin, None without one."""
+    return None if plugin is None else digest(Path(plugin))
+
+
 def check_folder(folder: Path) -> None:
     """Raise if a folder cannot be made or written in."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())

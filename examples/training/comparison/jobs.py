@@ -15,6 +15,7 @@ from training import files
 from training.comparison.arms import PLAIN, Arm, with_defaults
 from training.evaluating import evaluation_folder
 from training.finished import is_finished, read_json
+from training.plugins import plugin_words
 from training.records import read_table, write_table
 from training.settings.command_line import composed
 from training.settings.environment import EnvironmentSettings
@@ -46,6 +47,8 @@ class Evaluation:
     """``wheels`` or ``kinematic``; None: as trained."""
     filtered: bool = False
     """True if actions pass the filter."""
+    plugin: str | None = None
+    """Path of the plugin."""
 
 
 TESTED = Evaluation(("test",), 200)
@@ -93,7 +96,7 @@ class Job:
         """Return the command that trains the run, or resumes it from its checkpoint."""
         script = [str(SCRIPTS / "train.py")]
         if (self.path / files.CHECKPOINT).exists() and not anew:
-            return [*script, f"resume={self.path}"]
+            return [*script, f"resume={self.path}", *plugin_words(self.overrides(overrides))]
         return [*script, *self.overrides(overrides), "overwrite=true"]
 
     def evaluates(self, wanted: Evaluation) -> list[str]:
@@ -103,6 +106,7 @@ class Job:
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
             *(["--physics", wanted.physics] if wanted.physics else []),
             *(["--filter"] if wanted.filtered else []),
+            *(["--plugin", wanted.plugin] if wanted.plugin else []),
         ]
 
     def physics(self, wanted: Evaluation) -> str:
@@ -145,9 +149,11 @@ class Job:
 
     def differences(self, asked: TrainSettings) -> list[str]:
         """Return the settings that differ from those asked for."""
-        found = read_json(self.path / files.SETTINGS)
+        found = dict(read_json(self.path / files.SETTINGS))
         if not found:
             return []
+        if found.pop("plugin_sha256", None) != files.digest_of(asked.plugin):
+            return ["another plugin than the present one"]
         had, wanted = (dict(settings_by_name(each)) for each in (as_settings(found), asked))
         return [
             f"{name}={had[name]}, asked for is {value}"

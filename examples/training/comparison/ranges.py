@@ -23,7 +23,17 @@ from training.worlds import is_of_a_test
 
 OF_THE_SEARCH = ("seed", "run_dir", "overwrite", "resume", "checkpoint_every")
 """Settings that a search gives each of its runs."""
-_ALIKE = ("actions", "evaluation", "curriculum", "regime", "tracking", "ray", "device", "threads")
+_ALIKE = (
+    "actions",
+    "plugin",
+    "evaluation",
+    "curriculum",
+    "regime",
+    "tracking",
+    "ray",
+    "device",
+    "threads",
+)
 """Groups that are the same in all trials: how trials are compared, and where they run."""
 
 

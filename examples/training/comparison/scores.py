@@ -66,7 +66,9 @@ def read_scores(paths: Sequence[Path]) -> pd.DataFrame:
                 raise ValueError(f"{file} must have the columns {', '.join(COLUMNS)}: no {missing}")
     if not tables:
         names = ", ".join(map(str, paths))
-        raise ValueError(f"{names}: no table with the columns {', '.join(COLUMNS)} and a row")
+        raise ValueError(
+            f"{names}: neither {files.EPISODES} of compare.py nor rows of {', '.join(COLUMNS)}"
+        )
     rows = pd.concat(tables, ignore_index=True)
     twice = rows[rows.duplicated(["task", "method", "seed", "steps"])]
     if len(twice):

@@ -31,6 +31,7 @@ from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
 from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
+from training.plugins import SIGNALS
 from training.run.driving import Robots
 from training.settings.learners import LearnerSettings, is_discrete
 from training.settings.train import TrainSettings
@@ -64,7 +65,7 @@ def make_learner(
     limit = settings.saturation_limit
     actor = make(*sizes, **network, saturation_limit=limit if settings.full_range else None)
     of_loss: Options = {
-        **loss_options(method),
+        **_options(method),
         "gamma": settings.gamma,
         "reward_scale": settings.reward_scale,
         "saturation_penalty": settings.saturation_penalty,
@@ -93,8 +94,14 @@ def make_learner(
     return ActorCriticLearner(loss, policy_delay=settings.policy_delay, **of_learner)
 
 
-def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
+def _options(method: Method) -> Options:
+    """Return the options of a loss; signals of a plugin are none that a loss writes."""
     options = loss_options(method)
+    return options | {"signals": [name for name in options["signals"] if name not in SIGNALS]}
+
+
+def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
+    options = _options(method)
     loss = SignalDQNLoss(
         network,
         **{name: options[name] for name in ("signals", "importance", "loss_function")},

@@ -87,6 +87,8 @@ def state_of(run: TrainingRun) -> dict[str, Any]:
         "buffer": run.buffer.state_dict(),
         "explorer": run.explorer.state_dict(),
         "curiosity": None if run.curiosity is None else run.curiosity.checkpoint(),
+        "signals": run.signals.state_dict(),
+        "plugin": files.digest_of(run.settings.plugin),
         "best": None if run.best is None else dict(run.best.state_dict()),
         "records": [asdict(record) for record in run.records],
         "evaluations": [asdict(record) for record in run.evaluations],
@@ -105,6 +107,7 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
     run.explorer.load_state_dict(state["explorer"])
     if run.curiosity is not None:
         run.curiosity.restore(state["curiosity"])
+    run.signals.load_state_dict(state.get("signals", {}))
     if state["best"] is not None:
         run.best = copy.deepcopy(run.learner.policy)
         run.best.load_state_dict(state["best"])

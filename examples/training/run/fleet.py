@@ -126,6 +126,7 @@ class Fleet(Robots):
                 include_dashboard=False,
                 log_to_driver=False,
                 configure_logging=False,
+                runtime_env=_with_plugin(settings.plugin),
             )
         self._collector: Any = None
         self._reports: Iterator[TensorDictBase] = iter(())
@@ -273,6 +274,18 @@ class Fleet(Robots):
         super().close()
         if self._owns_ray:
             ray.shutdown()
+
+
+def _with_plugin(plugin: str | None) -> dict[str, Any]:
+    """Return what Ray needs so that its processes load a plugin first."""
+    if plugin is None:
+        return {}
+    from training.plugins import load_plugin
+
+    def load() -> None:
+        load_plugin(plugin)
+
+    return {"worker_process_setup_hook": load}
 
 
 def _make_env(settings: TrainSettings, robots: int, world: str) -> EnvBase:

@@ -17,9 +17,11 @@ from tqdm import tqdm
 from mpfa_envs import GoalRelabeling
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import run_updates
+from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
+from training.plugins import OwnSignals
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
 from training.run.checkpoints import (
@@ -113,6 +115,7 @@ class TrainingRun:
         self.learner = make_learner(
             settings.learner, method, *sizes, device=device, compile=self._to_compile
         )
+        self.signals = OwnSignals(learned_signals(method))
         self.curiosity = make_curiosity(method, *sizes, device=device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
         replay = self.robots.make_replay(
@@ -248,7 +251,7 @@ class TrainingRun:
             self._events.append(("on_update", {**losses, **self._bonus}, batch))
 
     def _prepared(self, sampled: SampledBatch) -> SampledBatch:
-        """Move a sampled batch to the networks, and add the bonus of curiosity to its rewards."""
+        """Move a sampled batch to the networks, and add signals and bonuses of the run."""
         device = self.settings.device
         if sampled.gives_signals:
             self.log.learns(sampled.batch["index"])
@@ -256,6 +259,8 @@ class TrainingRun:
             sampled = replace(sampled, batch=sampled.batch.to(device))
         if self.curiosity is not None and sampled.gives_signals:
             self._bonus = self.curiosity(sampled.batch)
+        if sampled.gives_signals:
+            self.signals.write(self.learner, sampled.batch)
         return sampled
 
     def _evaluate(self) -> None:

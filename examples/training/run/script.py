@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 import torch
@@ -22,6 +22,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.finished import after_the_end, is_finished
+from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
 from training.run.checkpoints import read_checkpoint
@@ -53,8 +54,9 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
     Raises:
         SystemExit: Unless the exit status is 0; ``train.py`` lists the others.
     """
-    register()
     try:
+        arguments, _ = with_plugin(arguments)
+        register()
         overrides = parse_overrides(arguments)
         folders = [o.value() for o in overrides if o.key_or_group == "resume"]
         resumes = bool(folders) and folders[-1] is not None
@@ -145,6 +147,7 @@ def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) 
                     raise ValueError(f"resume: {name} has no effect, a run resumes in its folder")
             held.enter_context(files.lock(folder))
             state = read_checkpoint(folder)
+            _check_plugin(state, overrides)
             settings = changed(state["settings"], overrides)
             check_settings(settings)
             before = as_settings(state["settings"])
@@ -158,6 +161,16 @@ def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) 
             (folder / files.STATUS).unlink(missing_ok=True)
             write_settings(settings, folder / files.SETTINGS)
         return _train(training)
+
+
+def _check_plugin(state: dict[str, Any], overrides: list[Override]) -> None:
+    """Raise if a run that had a plugin gets none; warn if the plugin is another one."""
+    had, before = state["settings"].get("plugin"), state.get("plugin")
+    given = [each.value() for each in overrides if each.key_or_group == "plugin"]
+    if had is not None and not given:
+        raise ValueError(f"resume: the run was made with a plugin: add plugin={had}")
+    if given and files.digest_of(given[-1]) != before:
+        print("warning: it is another plugin than when the run was saved", file=sys.stderr)
 
 
 def prepare_process(settings: TrainSettings) -> None:
@@ -204,7 +217,9 @@ def _train(training: TrainingRun) -> int:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0
     saved = (folder / files.CHECKPOINT).exists()
-    how = f"continue with: train.py resume={folder}" if saved else "nothing of it was saved"
+    plugin = training.settings.plugin
+    words = f"resume={folder}" + (f" plugin={plugin}" if plugin else "")
+    how = f"continue with: train.py {words}" if saved else "nothing of it was saved"
     if failure is not None:
         print(f"train.py: {failure}", file=sys.stderr)
     print(f"stopped after {training.actions} actions; {how}")
@@ -214,6 +229,8 @@ def _train(training: TrainingRun) -> int:
 def write_settings(settings: TrainSettings, path: Path) -> None:
     """Write the settings of a run as JSON."""
     values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
+    if settings.plugin is not None:
+        values["plugin_sha256"] = files.digest_of(settings.plugin)
     write_text_atomically(json.dumps(values, indent=2) + "\n", path)
 
 

@@ -15,19 +15,16 @@ from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
 from training.environments import check_physics, make_training_env, task_arguments
+from training.plugins import OF_LOSSES, SIGNALS
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
-from training.settings.rules import check_rules, choice, named, up_to
+from training.settings.rules import check_rules, named, up_to
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test
 
-OF_A_METHOD: dict[str, Rule] = {"name": choice(*METHODS), "capacity": up_to(10**9)}
+A_METHOD: Rule = (lambda value: value in METHODS, "the name of a method")
+OF_A_METHOD: dict[str, Rule] = {"name": A_METHOD, "capacity": up_to(10**9)}
 """Values of a method that a machine has room for; a method checks the rest itself."""
-SIGNALS = (
-    *("reward", "td_error", "action_gradient", "value"),
-    *("relative_value", "relative_td_error", "information_gain"),
-)
-"""Signals that the losses of ``train.py`` write; a script of your own may have others."""
 
 
 def check_settings(settings: TrainSettings) -> None:
@@ -107,9 +104,13 @@ def _check_method(method: Method) -> None:
     """Raise if the method rejects its settings, or cannot learn with them."""
     with named("method."):
         replace(method)
+    known = [*OF_LOSSES, *SIGNALS]
     for signal in method.priority_signals():
-        if signal.name not in SIGNALS:
-            raise ValueError(f"method.signals must be of {', '.join(SIGNALS)}, got {signal.name!r}")
+        if signal.name not in known:
+            raise ValueError(
+                f"method.signals must be of {', '.join(known)}, got {signal.name!r}: a plugin can "
+                "register others"
+            )
     if method.capacity < method.rows:
         raise ValueError(
             f"method.capacity must hold a batch of {method.rows}, got {method.capacity}: it would "
@@ -145,7 +146,7 @@ def _check_discrete(settings: TrainSettings) -> None:
     method, algorithm = settings.method, settings.learner.algorithm
     if settings.learner.compile is True:
         raise ValueError(f"learner.compile must be false with {algorithm}, got True")
-    own = {"reward", "td_error", "action_gradient"}
+    own = {"reward", "td_error", "action_gradient", *SIGNALS}
     signals = [signal.name for signal in method.priority_signals()]
     # A table has no loss that could bend.
     distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)

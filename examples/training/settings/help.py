@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from training.plugins import with_plugin
 from training.settings.from_file import with_lines
 from training.settings.train import GROUPS, register
 
@@ -24,6 +25,7 @@ Options of Hydra, as --multirun and --cfg: --hydra-help"""
 
 def help_text(usage: str, arguments: Sequence[str] = ()) -> str:
     """Return usage, the choices of each group, and every setting with its value."""
+    arguments, _ = with_plugin(arguments)
     register()
     given = [text for text in with_lines(arguments) if not text.startswith("-")]
     try:

@@ -27,6 +27,7 @@ LAWFUL = (
     "curriculum.name",
     "evaluation.every",
     "checkpoint_every",
+    "plugin",
     "tracking.mode",
     "tracking.csv",
     "tracking.tensorboard",

@@ -255,6 +255,9 @@ class TrainSettings:
     actions: int | None = setting(None, at_least(1))
     """Length of the run: actions of all robots in all stages, which share them in the proportion of
     their lengths, also where these count episodes; null: as ``curriculum.stages`` says."""
+    plugin: str | None = setting(None, WORD)
+    """Python file that is imported first: it may register methods, signals, robots and generators.
+    A resumed run must be given it again."""
     checkpoint_every: int = setting(10_000, at_least(1))
     """Actions between two checkpoints."""
     robots: int = setting(1, up_to(MOST_ROBOTS, why=", as a robot takes up to 1.6 MB of memory"))
