@@ -19,6 +19,8 @@ import mpfa_envs
 import torchrl_mpfa
 import torchrl_mpfa.methods
 from mpfa_envs import World, deploy, export_policy, load_policy, planners, render
+from torchrl_mpfa.methods import METHODS
+from training.plugins import SIGNALS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -177,11 +179,15 @@ def run(page: str, changes: dict[str, str]) -> dict[str, Any]:
     for size, small in changes.items():
         assert size in text
         text = text.replace(size, small)
+    before = dict(METHODS), dict(SIGNALS)
     try:
         for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             exec(block, names)
     finally:
         torch.set_flush_denormal(False)
+        for registered, names_before in zip((METHODS, SIGNALS), before, strict=True):
+            registered.clear()
+            registered.update(names_before)
     return names
 
 

@@ -16,7 +16,11 @@ DOCS = ROOT / "docs"
 PAGES = ["howto/signal.md"]
 FILE = re.compile(r"^```python\n# (\w+\.py)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^    (?:\.venv/bin/)?(python [^#\n]*)", re.MULTILINE)
-SHORT = ((r"\bactions=\d+", "actions=1200"), (r"--trials \d+", "--trials 1"), (r"0 1 2", "0 1"))
+SHORT = (
+    (r"\bactions=\d+", "actions=1200 evaluation.every=600"),
+    (r"--trials \d+", "--trials 1"),
+    (r"0 1 2", "0 1"),
+)
 
 
 @pytest.mark.slow

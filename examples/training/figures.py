@@ -57,13 +57,13 @@ def plot_scores(tasks: Mapping[str, Mapping[str, Mapping[str, Curve]]], path: Pa
         path: The PNG file.
     """
     methods = dict.fromkeys(method for runs in tasks.values() for method in runs)
-    places = {method: number for number, method in enumerate(methods)}
     columns = min(len(tasks), 3)
     figure, axes = new_figure(-(-len(tasks) // columns), columns, panel=(5.0, 3.6))
     for axis, (task, runs) in zip(axes, tasks.items(), strict=False):
-        curves = {method: list(each.values()) for method, each in runs.items()}
+        # A method without a run here keeps its color.
+        curves = {method: list(runs.get(method, {}).values()) for method in methods}
         few = max(map(len, curves.values())) < _SPREAD
-        draw_seeds(axis, curves, band="runs" if few else "interval", places=places)
+        draw_seeds(axis, curves, band="runs" if few else "interval")
         axis.set(xlabel="steps", ylabel="score", title=task)
     for axis in axes[len(tasks) :]:
         axis.remove()

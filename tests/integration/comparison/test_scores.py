@@ -86,7 +86,10 @@ def test_each_task_has_tables_of_its_own(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("task,method,seed,steps\nR,sac,0,1\n", "must have the columns .*: no .'score'"),
-        ("task,method,seed,steps,score\n", "neither episodes.csv of compare.py nor rows of task, method"),
+        (
+            "task,method,seed,steps,score\n",
+            "neither episodes.csv of compare.py nor rows of task, method",
+        ),
         ("task,method,seed,steps,score\nR,sac,0,1,2\nR,sac,0,2,many\n", ":3: score must be a fin"),
         ("task,method,seed,steps,score\nR,sac,0,1,2\nR,sac,0,1,3\n", "got two of task R, method"),
         (
