@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from torchrl_mpfa.signals import REWARD as REWARD
     from torchrl_mpfa.signals import TD_ERROR as TD_ERROR
     from torchrl_mpfa.signals import Signal as Signal
+    from torchrl_mpfa.stopping import Stop as Stop
     from torchrl_mpfa.storages import SignalMemmapStorage as SignalMemmapStorage
     from torchrl_mpfa.storages import SignalTensorStorage as SignalTensorStorage
     from torchrl_mpfa.updates import run_updates as run_updates
@@ -61,6 +62,7 @@ _NAMES = {
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "samplers": "MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",
+    "stopping": "Stop",
     "storages": "SignalMemmapStorage SignalTensorStorage",
     "updates": "run_updates",
 }

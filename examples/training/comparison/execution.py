@@ -13,10 +13,10 @@ from typing import Any, Generic, TypeVar
 
 from tqdm import tqdm
 
+from torchrl_mpfa import Stop
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
 from training.comparison.workers import LocalWorker, Lost, Worker
-from training.stopping import Stop
 
 LOG = "output.log"
 """Output of the scripts, in the folder of a run."""
@@ -155,7 +155,7 @@ class Work(ABC, Generic[Item]):
 
     def run(self) -> Stop:
         """Make all items, some at a time; return how that was stopped."""
-        stop = Stop("saving the runs; the same command continues them")
+        stop = Stop("saving the runs; the same command continues them", write=tqdm.write)
         with stop.listening():
             try:
                 while (self.has_more or self.running) and not stop:

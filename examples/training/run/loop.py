@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from mpfa_envs import GoalRelabeling
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
-from torchrl_mpfa import run_updates
+from torchrl_mpfa import Stop, run_updates
 from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
@@ -41,7 +41,6 @@ from training.run.tracking import Tracker
 from training.run.updates import UpdateLog
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
-from training.stopping import Stop
 
 _MANY_EPISODES = 500
 """From here on the learning rates fall linearly unless the settings say otherwise."""
@@ -75,7 +74,7 @@ class TrainingRun:
         self.settings = settings
         self.folder = folder
         self.schedule = Schedule(settings.curriculum.stages)
-        self.stop = Stop()
+        self.stop = Stop(write=tqdm.write)
         torch.manual_seed(settings.seed)
         self.robots = make_robots(settings)
         env = self.robots.environment(self.schedule.world)

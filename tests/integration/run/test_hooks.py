@@ -20,6 +20,7 @@ from tests.integration.tiny_runs import (
     tiny,
     train,
 )
+from torchrl_mpfa import Stop
 from training import files
 from training.records import EvaluationRecord, read_table
 from training.run import loop
@@ -27,7 +28,6 @@ from training.run.checkpoints import read_checkpoint
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.train import Stage, TrainSettings
-from training.stopping import Stop
 
 PAGE = Path(__file__).parents[3] / "docs" / "tuning.md"
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-from tqdm import tqdm
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -24,8 +23,14 @@ class Stop:
         (False, None, True, 0)
     """
 
-    def __init__(self, answer: str = "stopping and saving") -> None:
+    def __init__(
+        self,
+        answer: str = "stopping and saving",
+        *,
+        write: Callable[[str], object] | None = None,
+    ) -> None:
         self.answer = answer
+        self._write = write or (lambda text: sys.stderr.write(f"{text}\n"))
         self.signal: int | None = None
         """Number of the signal, 0 if the program itself asked, None if nobody did."""
 
@@ -46,7 +51,7 @@ class Stop:
             raise KeyboardInterrupt
         self.signal = number
         name = signal.Signals(number).name
-        tqdm.write(f"{name}: {self.answer}; once more to stop at once")
+        self._write(f"{name}: {self.answer}; once more to stop at once")
 
     @contextmanager
     def listening(self) -> Iterator[None]:
