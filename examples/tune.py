@@ -81,7 +81,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         if options.seeds.count(seed) > 1:
             parser.error(f"--seeds has {seed} twice")
     if find_spec("optuna") is None:
-        parser.error("it needs Optuna: pip install 'torchrl-mpfa[tune]'")
+        parser.error("it needs Optuna: install the extra 'tune', see Install in the README")
     # Imports Optuna, an extra of its own.
     from training.comparison.ranges import read_ranges
 

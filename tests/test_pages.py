@@ -13,11 +13,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = ["howto/signal.md"]
+PAGES = ["howto/signal.md", "howto/torchrl_script.md", "howto/train.md"]
 FILE = re.compile(r"^```python\n# (\w+\.py)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^    (?:\.venv/bin/)?(python [^#\n]*)", re.MULTILINE)
 SHORT = (
-    (r"\bactions=\d+", "actions=1200 evaluation.every=600"),
+    (r"\bactions=(\d+)000", lambda found: f"actions={50 * int(found[1])} evaluation.every=500"),
     (r"--trials \d+", "--trials 1"),
     (r"0 1 2", "0 1"),
 )

@@ -107,7 +107,10 @@ def __getattr__(name: str) -> Any:
             package = str(error.name).partition(".")[0]
             if package not in _OF_THE_EXTRA:
                 raise
-            needs = f"mpfa_envs.{name} needs {package}: pip install 'torchrl-mpfa[envs]'"
+            needs = (
+                f"mpfa_envs.{name} needs {package}: install the extra 'envs', see Install in the "
+                "README"
+            )
             raise ImportError(needs, name=error.name) from error
     return _submodule(__name__, name)
 

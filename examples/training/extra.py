@@ -6,4 +6,7 @@ _missing = [
     name for name in ("hydra", "matplotlib", "pandas", "tqdm", "wandb") if not find_spec(name)
 ]
 if _missing:
-    raise SystemExit(f"this script needs {', '.join(_missing)}: pip install '.[examples]'")
+    raise SystemExit(
+        f"this script needs {', '.join(_missing)}: install the extra 'examples', see Install in "
+        "the README"
+    )

@@ -36,7 +36,8 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
         (
             "gymnasium",
             "from mpfa_envs import NavigationEnv",
-            "mpfa_envs.NavigationEnv needs gymnasium: pip install 'torchrl-mpfa[envs]'",
+            "mpfa_envs.NavigationEnv needs gymnasium: install the extra 'envs', see Install in the "
+            "README",
         ),
         (
             "onnxruntime",
@@ -47,7 +48,7 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
             "onnx",
             "from mpfa_envs import export_policy, load_policy;"
             f"export_policy(load_policy({SHIPPED!r}), 'policy.onnx')",
-            "pip install 'torchrl-mpfa[onnx]'",
+            "install the extra 'onnx', see Install in the README",
         ),
     ],
 )

@@ -34,7 +34,9 @@ class Network:
             import onnxruntime
         except ImportError as error:
             needs = f"an exported policy needs onnxruntime ({error})"
-            raise ImportError(f"{needs}: pip install 'torchrl-mpfa[onnx]'") from error
+            raise ImportError(
+                f"{needs}: install the extra 'onnx', see Install in the README"
+            ) from error
         options = onnxruntime.SessionOptions()
         # For so small a network threads wait longer for each other than they compute.
         options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -160,7 +160,9 @@ def onnx_content(layers: Sequence[Layer], observation_size: int, *, quantize: bo
         from onnx import TensorProto, helper
     except ImportError as error:
         needs = f"the export of a policy needs onnx ({error})"
-        raise ImportError(f"{needs}: pip install 'torchrl-mpfa[onnx]'") from error
+        raise ImportError(
+            f"{needs}: install the extra 'onnx', see Install in the README"
+        ) from error
 
     graph = _Graph(np.float32 if quantize else np.float64)
     graph.add("Cast", "observation", to=graph.kind)

@@ -16,7 +16,7 @@ except ImportError as error:
     raise ImportError(
         "physics='wheels' needs PyBullet, which has wheels for Python 3.11 and earlier only, and "
         f"this is Python {platform.python_version()}: use physics='kinematic', which needs no "
-        "PyBullet, or Python 3.11 and pip install 'torchrl-mpfa[envs]'"
+        "PyBullet, or on Python 3.11 install the extra 'envs', see Install in the README"
     ) from error
 
 if TYPE_CHECKING:

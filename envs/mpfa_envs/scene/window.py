@@ -22,7 +22,7 @@ class Window:
             import pygame
         except ImportError as error:
             raise DependencyNotInstalled(
-                "a live window needs pygame: pip install 'torchrl-mpfa[live]'"
+                "a live window needs pygame: install the extra 'live', see Install in the README"
             ) from error
         # A picture needs no 3D, and a driver that renders in software brings another LLVM:
         # importing PyTorch's Triton after that ends the process.

@@ -35,7 +35,7 @@ class OrcaRoom:
             from pyrvo import RVOSimulator
         except ImportError as error:
             raise ImportError(
-                "behavior='orca' needs pyrvo: pip install 'torchrl-mpfa[orca]'"
+                "behavior='orca' needs pyrvo: install the extra 'orca', see Install in the README"
             ) from error
         self._walkers = world.walkers
         self._simulator: Any = RVOSimulator()

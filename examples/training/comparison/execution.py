@@ -54,7 +54,7 @@ class Running:
         self.job, self.worker, self._commands = job, worker, commands
         job.path.mkdir(parents=True, exist_ok=True)
         self.log = job.path / LOG
-        self.bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
+        self.bar = tqdm(desc=job.name, unit="episode", position=position, leave=False, disable=None)
         self._start()
 
     def _start(self) -> None:
@@ -185,7 +185,9 @@ class Runs(Work[Job]):
         workers: Sequence[Worker],
     ) -> None:
         # The average of the runs that are done shows how long the others will take.
-        bar = tqdm(desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False)
+        bar = tqdm(
+            desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False, disable=None
+        )
         super().__init__(waiting, workers, bar)
         self.overrides, self.wanted, self.anew = overrides, wanted, anew
         self.failed: list[Job] = []
@@ -259,7 +261,9 @@ def workers_of(address: str | None, count: int) -> Iterator[list[Worker]]:
     try:
         from training.comparison.clusters import RemoteWorker, connected
     except ImportError as error:
-        raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
+        raise ValueError(
+            "--ray needs Ray: install the extra 'ray', see Install in the README"
+        ) from error
     try:
         with connected(address or None):
             yield [RemoteWorker() for _ in range(count)]

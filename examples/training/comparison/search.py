@@ -160,7 +160,9 @@ class Search(Work[Trial]):
         self.failures = 0
         """Trials that failed, one after another."""
         total, done = max(trials, self._asked), self._asked - len(waiting)
-        bar = tqdm(desc="trials", total=total, initial=done, unit="trial", smoothing=0)
+        bar = tqdm(
+            desc="trials", total=total, initial=done, unit="trial", smoothing=0, disable=None
+        )
         super().__init__(waiting, workers, bar)
 
     def _again(self, found: FrozenTrial) -> Trial:

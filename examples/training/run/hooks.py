@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ _RECENT = 100
 """Episodes whose success is shown."""
 _REPORT_EVERY = 1.0
 """Time between two reports of progress [s]."""
+_LINE_EVERY = 60.0
+"""Time between two lines, where there is no terminal [s]."""
 
 
 class Hook:
@@ -70,16 +73,22 @@ class Hook:
 
 
 class Progress(Hook):
-    """Shows the progress of a run: a bar in the terminal, and ``status.json`` in its folder."""
+    """Shows the progress of a run, and writes ``status.json`` in its folder.
+
+    It is a bar in the terminal, and in a file a line a minute.
+    """
 
     def __init__(self) -> None:
         self._bar: tqdm[Any] | None = None
         self._reported = 0.0
+        self._line = time.monotonic()
 
     def on_begin(self, run: TrainingRun) -> None:
         """Show the bar."""
         done = run.schedule
-        self._bar = tqdm(total=done.total, initial=done.done, unit=done.unit, smoothing=0.05)
+        self._bar = tqdm(
+            total=done.total, initial=done.done, unit=done.unit, smoothing=0.05, disable=None
+        )
 
     def on_iteration(self, run: TrainingRun) -> None:
         """Move the bar, and report the success and the speed once a second."""
@@ -87,13 +96,24 @@ class Progress(Hook):
         self._bar.update(run.schedule.done - self._bar.n)
         if time.monotonic() - self._reported > _REPORT_EVERY:
             self._reported = time.monotonic()
-            self._bar.set_postfix_str(report(run))
+            self._show(run, report(run))
 
     def on_end(self, run: TrainingRun) -> None:
         """Report the end once all is saved: a reader may then remove the checkpoint."""
         assert self._bar is not None
-        self._bar.set_postfix_str(report(run, saved=True))
+        self._line = 0.0
+        self._show(run, report(run, saved=True))
         self.close()
+
+    def _show(self, run: TrainingRun, summary: str) -> None:
+        """Show a summary beside the bar, or in a line if the last one is a minute old."""
+        assert self._bar is not None
+        if not self._bar.disable:
+            self._bar.set_postfix_str(summary)
+        elif time.monotonic() - self._line > _LINE_EVERY:
+            self._line = time.monotonic()
+            now = run.schedule
+            print(f"{now.done} of {now.total} {now.unit}s, {summary}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """End the line of the bar."""

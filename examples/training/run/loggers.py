@@ -86,10 +86,11 @@ class TensorboardLog:
     Args:
         folder: Of the run.
         actions: Actions after which the run resumes; 0: it begins.
+        settings: Of the run, by their dotted names.
     """
 
-    def __init__(self, folder: Path, *, actions: int) -> None:
-        self._folder, self._actions = folder, actions
+    def __init__(self, folder: Path, *, actions: int, settings: Mapping[str, Any]) -> None:
+        self._folder, self._actions, self._settings = folder, actions, settings
 
     @cached_property
     def _logger(self) -> Any:
@@ -104,7 +105,9 @@ class TensorboardLog:
                 folder = self._folder / files.TENSORBOARD
                 return SummaryWriter(str(folder), purge_step=self._actions + 1)
 
-        return Continued(files.TENSORBOARD, log_dir=str(self._folder))
+        made = Continued(files.TENSORBOARD, log_dir=str(self._folder))
+        add_settings(made.experiment, self._settings, self._actions)
+        return made
 
     def log(self, entries: Mapping[str, Any], actions: int) -> None:
         """Log what is no table."""
@@ -128,6 +131,20 @@ class TensorboardLog:
         """Close the files, if there are any."""
         if "_logger" in vars(self):
             self._logger.experiment.close()
+
+
+def add_settings(writer: Any, settings: Mapping[str, Any], actions: int) -> None:
+    """Log settings as a text, and as hyperparameters of the success in evaluations."""
+    from torch.utils.tensorboard.summary import hparams
+
+    lines = [f"| {name} | {value} |" for name, value in settings.items()]
+    writer.add_text("settings", "\n".join(["| setting | value |", "|---|---|", *lines]), actions)
+    plain = {
+        name: value if isinstance(value, bool | int | float | str) else str(value)
+        for name, value in settings.items()
+    }
+    for summary in hparams(plain, {"evaluation/success": 0.0}):
+        writer._get_file_writer().add_summary(summary)
 
 
 def add_gif(writer: Any, name: str, path: Path, actions: int) -> None:

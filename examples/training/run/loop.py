@@ -23,6 +23,7 @@ from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
 from training.plugins import OwnSignals
 from training.records import EpisodeRecord, EvaluationRecord
+from training.run import showing
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
 from training.run.checkpoints import (
     Checkpoints,
@@ -36,7 +37,6 @@ from training.run.evaluations import evaluate_policy
 from training.run.exploration import make_explorer
 from training.run.hooks import Hook, Progress
 from training.run.schedule import Schedule
-from training.run.showing import show_policy
 from training.run.tracking import Tracker
 from training.run.updates import UpdateLog
 from training.settings.learners import is_discrete
@@ -103,7 +103,7 @@ class TrainingRun:
         """Actions before the last iteration."""
         run_id = None if state is None else state["wandb"]
         self.tracker = Tracker(settings, folder, run_id=run_id, actions=self.actions)
-        self.hooks = [self.tracker, Checkpoints(), Progress(), *hooks]
+        self.hooks = [self.tracker, Checkpoints(), showing.Pictures(), Progress(), *hooks]
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
@@ -157,7 +157,6 @@ class TrainingRun:
 
         Whatever ends it, the run is saved as it is then, unless an error broke its parts.
         """
-        begun = self.actions
         with self.stop.listening():
             try:
                 self._call(("on_begin",))
@@ -169,8 +168,6 @@ class TrainingRun:
                     save(self)
                 raise
         self._call(("on_end",))
-        if self.schedule.finished and self.actions > begun:
-            show_policy(self)
         return self.schedule.finished
 
     def _call(self, *events: tuple[Any, ...]) -> None:
@@ -207,7 +204,7 @@ class TrainingRun:
         # Only now: a run that a hook ends resumes as if it had been stopped.
         self._call(*self._events)
         if self.crossed(self.settings.tracking.pictures_every or 0):
-            show_policy(self)
+            showing.show_policy(self)
         # Last: a run that an error ends before here begins the stage when it resumes.
         self._advance()
         self._anneal()

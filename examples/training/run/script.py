@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -33,7 +33,7 @@ from training.settings.checks import check_settings
 from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import with_lines
 from training.settings.resuming import changed, check_lawful, check_single
-from training.settings.train import TrainSettings, as_settings, register
+from training.settings.train import TrainSettings, as_settings, plain_settings, register
 
 WRONG = 2
 """Exit status of a command line that cannot be."""
@@ -228,7 +228,7 @@ def _train(training: TrainingRun) -> int:
 
 def write_settings(settings: TrainSettings, path: Path) -> None:
     """Write the settings of a run as JSON."""
-    values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
+    values = plain_settings(settings)
     if settings.plugin is not None:
         values["plugin_sha256"] = files.digest_of(settings.plugin)
     write_text_atomically(json.dumps(values, indent=2) + "\n", path)

@@ -17,10 +17,23 @@ from training.evaluating import drive
 from training.pictures import EPISODE, TRAJECTORIES, VALUES, write_pictures
 from training.records import as_table
 from training.run.evaluations import SEED, kept_policy
+from training.run.hooks import Hook
 from training.run.values import values_of
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
+
+
+class Pictures(Hook):
+    """Shows the policy of a finished run, before the run is reported as finished.
+
+    So a run whose pictures were interrupted makes them when it is resumed.
+    """
+
+    def on_end(self, run: TrainingRun) -> None:
+        """Show the policy."""
+        if run.schedule.finished:
+            show_policy(run)
 
 
 def show_policy(run: TrainingRun) -> None:

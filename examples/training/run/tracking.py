@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.hooks import Hook
 from training.run.loggers import CSVLog, Log, TensorboardLog
+from training.settings.rules import settings_by_name
 from training.settings.train import TrackingSettings, TrainSettings
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ class Tracker(Hook):
         if wanted.csv:
             self._logs.append(CSVLog(folder, actions=actions))
         if wanted.tensorboard:
-            self._logs.append(TensorboardLog(folder, actions=actions))
+            named = dict(settings_by_name(settings))
+            self._logs.append(TensorboardLog(folder, actions=actions, settings=named))
 
     def on_episode(self, run: TrainingRun, record: EpisodeRecord) -> None:
         """Log one episode."""

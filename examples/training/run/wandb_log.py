@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,14 @@ import pandas as pd
 import torch
 import wandb
 
-from training.settings.train import TrainSettings
+from training.settings.train import TrainSettings, plain_settings
 
 AXIS = "actions"
 """Axis of every entry: actions of all robots so far."""
+
+
+BEST = ("evaluation/success", "evaluation/spl")
+"""Entries of which the summary keeps the best."""
 
 
 class WandbLog:
@@ -46,7 +49,7 @@ class WandbLog:
                 tags=[part[:64] for part in (*parts, settings.regime)],
                 mode=settings.tracking.mode,  # type: ignore[arg-type]
                 dir=folder,
-                config=asdict(settings),
+                config=plain_settings(settings),
                 allow_val_change=True,
             )
         except wandb.Error as error:
@@ -56,6 +59,8 @@ class WandbLog:
             ) from error
         # wandb's own step takes one value of a key, and several episodes may end at one action.
         self._run.define_metric("*", step_metric=AXIS)
+        for name in BEST:
+            self._run.define_metric(name, step_metric=AXIS, summary="max")
         self._path = folder / "wandb" / f"logged-{run_id}.txt"
         self._path.parent.mkdir(exist_ok=True)
         self._path.touch()
@@ -65,7 +70,8 @@ class WandbLog:
 
     def log(self, entries: Mapping[str, Any], actions: int) -> None:
         """Log entries, unless they were logged before the run was stopped."""
-        if actions <= self._before:
+        # Pictures may have been interrupted after the numbers of the same action.
+        if actions <= self._before and not any(name.startswith("policy/") for name in entries):
             return
         shown = {name: _as_wandb(value) for name, value in entries.items()}
         self._run.log({**shown, AXIS: actions}, step=self._entries, commit=True)

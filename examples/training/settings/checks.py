@@ -48,7 +48,8 @@ def check_settings(settings: TrainSettings) -> None:
     check_physics(settings.environment.physics)
     if settings.tracking.tensorboard and find_spec("tensorboard") is None:
         raise ValueError(
-            "tracking=tensorboard needs TensorBoard: pip install 'torchrl-mpfa[tensorboard]'"
+            "tracking=tensorboard needs TensorBoard: install the extra 'tensorboard', see Install "
+            "in the README"
         )
 
 
@@ -124,7 +125,9 @@ def _check_ray(settings: TrainSettings) -> None:
     if not workers:
         return
     if find_spec("ray") is None:
-        raise ValueError(f"ray.workers={workers} needs Ray: pip install 'torchrl-mpfa[ray]'")
+        raise ValueError(
+            f"ray.workers={workers} needs Ray: install the extra 'ray', see Install in the README"
+        )
     if settings.robots % workers:
         raise ValueError(
             f"robots must be a multiple of ray.workers={workers}, got {settings.robots}"

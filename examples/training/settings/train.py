@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -412,3 +412,8 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         known = last in GENERATORS
         settings.evaluation.world = f"{HARDEST.get(last, last)}:validation" if known else last
     return settings
+
+
+def plain_settings(settings: TrainSettings) -> dict[str, Any]:
+    """Return the settings as plain values, without those of Hydra."""
+    return {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}

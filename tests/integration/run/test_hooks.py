@@ -160,6 +160,19 @@ def test_hooks_that_ask_to_stop_end_the_run_without_a_signal_and_a_signal_counts
         stop.ask(signal.SIGTERM)
 
 
+def test_progress_in_a_file_is_a_line_a_minute_and_one_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(tmp_path / "short", tiny())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(r"6 of 6 episodes, B: success \d+% of last 6, \d+ updates/s$", line)
+    monkeypatch.setattr("training.run.hooks._LINE_EVERY", 0.0)
+    monkeypatch.setattr("training.run.hooks._REPORT_EVERY", 0.0)
+    train(tmp_path / "long", tiny())
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 6 and "\r" not in lines[0]
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_the_script_on_the_page_stops_after_two_good_evaluations_in_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -17,6 +17,7 @@ import yaml
 
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
+from training.finished import is_finished
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.checkpoints import save
 from training.run.loop import TrainingRun
@@ -41,6 +42,7 @@ class Kept:
     def __init__(self) -> None:
         self.rows: dict[int, dict[str, Any]] = {}
         self.axes: dict[str, str] = {}
+        self.summaries: dict[str, str] = {}
         self.finished = 0
         self.artifacts: list[Any] = []
 
@@ -48,8 +50,9 @@ class Kept:
         step = max(self.rows, default=-1) + 1 if step is None else step
         self.rows.setdefault(step, {}).update(entries)
 
-    def define_metric(self, name: str, *, step_metric: str) -> None:
+    def define_metric(self, name: str, *, step_metric: str, summary: str = "") -> None:
         self.axes[name] = step_metric
+        self.summaries[name] = summary
 
     def log_artifact(self, artifact: Any) -> None:
         self.artifacts.append(artifact)
@@ -87,6 +90,8 @@ def test_episodes_that_end_at_one_action_are_all_in_the_log(tmp_path: Path, kept
     # All are plotted over the actions of the run.
     assert [row[kept.axes["*"]] for row in rows] == [160, 160, 160, 176, 176]
     assert (rows[-1]["evaluation/spl"], rows[-1]["evaluation/sct"]) == (0.4, 0.3)
+    assert kept.axes["evaluation/success"] == kept.axes["*"]
+    assert kept.summaries["evaluation/success"] == "max"
 
 
 def test_a_run_keeps_its_id_and_one_of_a_sweep_has_the_sweep_s(
@@ -172,6 +177,18 @@ def test_tensorboard_shows_the_same_rows_as_the_csv_files(in_both: tuple[Path, P
         assert [v for _, v in shown[name]] == pytest.approx([v for _, v in values]), name
 
 
+def test_tensorboard_has_the_settings_as_a_text_and_as_hyperparameters(
+    in_both: tuple[Path, Path],
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    reader = EventAccumulator(str(in_both[0] / files.TENSORBOARD))
+    reader.Reload()
+    text = reader.Tensors("settings/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "| method.name | mpfa_per |" in text and "hydra" not in text
+    assert "_hparams_/session_start_info" in reader.summary_metadata
+
+
 def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: Kept) -> None:
     settings = tiny(episodes=[Stage("A", 4)])
     settings.environment.max_steps = 25
@@ -221,7 +238,7 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
         show_policy(run)
         took.append((time.perf_counter() - begun[0], run.robots.elapsed() - begun[1]))
 
-    monkeypatch.setattr("training.run.loop.show_policy", show)
+    monkeypatch.setattr("training.run.showing.show_policy", show)
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
@@ -266,10 +283,31 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     settings = tiny(episodes=[Stage("A", 2)])
     settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, pictures_every=every)
-    monkeypatch.setattr("training.run.loop.show_policy", lambda run: shown.append(run.actions))
+    monkeypatch.setattr("training.run.showing.show_policy", lambda run: shown.append(run.actions))
     train(tmp_path / "run", settings)
     (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
     assert shown == [*(range(20, end, 20) if every else ()), end]
+
+
+def test_pictures_that_were_interrupted_are_made_when_the_run_resumes(
+    tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(run: TrainingRun) -> None:
+        raise KeyboardInterrupt
+
+    settings = tiny(episodes=[Stage("A", 1)])
+    settings.tracking = replace(OFFLINE)
+    settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
+    with monkeypatch.context() as patch:
+        patch.setattr("training.run.showing.show_policy", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path, settings)
+    assert not is_finished(tmp_path)
+    assert not any("policy/paths" in row for row in kept.rows.values())
+    go_on(tmp_path, settings)
+    assert is_finished(tmp_path)
+    assert sum("policy/paths" in row for row in kept.rows.values()) == 1
+    assert len(kept.artifacts) == 1
 
 
 def test_a_run_of_wandb_s_sweep_is_what_its_file_says(monkeypatch: pytest.MonkeyPatch) -> None:
