@@ -16,8 +16,15 @@ class Stop:
     """Flag that a program was asked to stop, with the number of the signal.
 
     The first signal lets the program end in good order, and prints the answer; the second stops it.
+    ``except KeyboardInterrupt`` does not do: inside a module of TorchRL, an interrupt becomes a
+    ``RuntimeError``.
+
+    Args:
+        answer: Text that the first signal prints.
+        write: Function that prints the text; None: to the standard error.
 
     Examples:
+        >>> from torchrl_mpfa import Stop
         >>> stop = Stop()
         >>> bool(stop), stop.ask(), bool(stop), stop.exit_status
         (False, None, True, 0)
