@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import resolve_robot
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.report import table
@@ -43,7 +44,7 @@ def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]
         run = read_json(path.parents[1] / files.SETTINGS)
         planner = " ".join(asked[name] for name in ("policy", "memory") if name in asked)
         driver = {
-            "robot": asked.get("robot") or run["environment"]["robot"],
+            "robot": resolve_robot(asked.get("robot") or run["environment"]["robot"]),
             "driver": planner.removesuffix(" none") or asked["card"]["learner"],
             "seed": asked.get("card", asked)["seed"],
             "filter": "filter" in asked,
@@ -63,11 +64,12 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     return [
         {
             **driver,
+            "robot": driver["robot"].name,
             "worlds": kind,
             "episodes": len(each),
             **each[[*_COUNTED, "spl", "sct"]].astype(float).mean(),
             "time_s": each.loc[each["success"], "time_s"].mean(),
-            **_beside(each, references.get(driver["robot"]), resolve_robot(driver["robot"])),
+            **_beside(each, references.get(driver["robot"]), driver["robot"]),
         }
         for driver, episodes in found
         for kind, each in episodes.groupby(episodes["world"].map(family), sort=False)

@@ -46,6 +46,7 @@ from mpfa_envs import (
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
@@ -108,7 +109,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--memory", choices=["none", "map"], default="none", help="map: dwa has a map of its own"
     )
     parser.add_argument(
-        "--robot", choices=list(ROBOTS), help="what a planner drives (default: turtlebot2)"
+        "--robot",
+        help=f"what a planner drives, {', '.join(ROBOTS)} or a YAML file (default: turtlebot2)",
     )
     parser.add_argument(
         "--worlds",
@@ -156,6 +158,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.robot is not None and options.policy is None:
         parser.error(f"--robot {options.robot} is for planners: a policy has its own")
     try:
+        options.robot = options.robot and resolve_robot(options.robot)
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
         if options.filter is None:
@@ -193,7 +196,8 @@ def name_of(options: argparse.Namespace) -> str:
     """Return the name of what is evaluated: the path of a policy, or a planner's name."""
     if options.policy is None:
         return str(options.path)
-    parts = [options.policy, options.memory if options.memory != "none" else "", options.robot]
+    parts = [options.policy, options.memory if options.memory != "none" else ""]
+    parts.append(options.robot.name if options.robot else "")
     return "-".join(part for part in parts if part)
 
 
@@ -339,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         else:
             document |= {"policy": options.policy, "memory": options.memory}
             if options.robot is not None:
-                document["robot"] = options.robot
+                document["robot"] = asdict(options.robot)
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from mpfa_envs.robots.model import ROBOTS as ROBOTS
     from mpfa_envs.robots.model import RobotModel as RobotModel
     from mpfa_envs.robots.noise import RobotNoise as RobotNoise
+    from mpfa_envs.robots.robot_file import RobotFileError as RobotFileError
+    from mpfa_envs.robots.robot_file import load_robot as load_robot
     from mpfa_envs.safety.filter import SafetyFilter as SafetyFilter
     from mpfa_envs.sensing.lidar import Lidar as Lidar
     from mpfa_envs.sensing.mirror import Mirror as Mirror
@@ -58,6 +60,8 @@ if TYPE_CHECKING:
 
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
+EXAMPLE_ROBOT = Path(__file__).parent / "assets" / "robots" / "example.yaml"
+"""A robot file to start your own from."""
 
 _NAMES = {
     "env.config": "PAPER_TASK TaskConfig",
@@ -76,6 +80,7 @@ _NAMES = {
     "robots.discrete": "DiscreteWheels",
     "robots.model": "ROBOTS RobotModel",
     "robots.noise": "RobotNoise",
+    "robots.robot_file": "RobotFileError load_robot",
     "safety.filter": "SafetyFilter",
     "sensing.lidar": "Lidar",
     "sensing.mirror": "Mirror RandomMirror",
@@ -93,7 +98,9 @@ _NAMES = {
 """Public names by module. A module is imported when a name of it is first used: a robot that
 runs :mod:`mpfa_envs.deploy` has neither SciPy nor torch, and Numba takes half a second."""
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
-__all__ = sorted(["EXAMPLE_WORLD", *_MODULE_OF], key=lambda name: (not name.isupper(), name))
+__all__ = sorted(
+    ["EXAMPLE_ROBOT", "EXAMPLE_WORLD", *_MODULE_OF], key=lambda name: (not name.isupper(), name)
+)
 _OF_THE_EXTRA = ("gymnasium", "numba", "PIL", "yaml", "scipy")
 
 

@@ -20,7 +20,7 @@ from mpfa_envs import (
     navigation_reward,
 )
 from mpfa_envs.env.config import lidar_arguments
-from mpfa_envs.robots.model import resolve_robot
+from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.tasks.reward import RewardFunction
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
@@ -45,7 +45,7 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     view = settings.field_of_view
     seen = {} if view in (None, robot.field_of_view) else {"lidar": lidar_arguments(view)}
     return {
-        "robot": settings.robot,
+        "robot": robot,
         "physics": settings.physics,
         "max_steps": settings.max_steps,
         "action_repeat": settings.action_repeat,

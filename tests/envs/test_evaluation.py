@@ -15,7 +15,6 @@ from mpfa_envs import (
     ROBOTS,
     NavigationEnv,
     Policy,
-    RobotModel,
     TaskConfig,
     VectorNavigationEnv,
     World,
@@ -30,7 +29,7 @@ from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, sct, spl, wil
 from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.policies.layers import Linear, Tanh
-from mpfa_envs.robots.model import resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 
 
 def steer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -280,7 +279,7 @@ BIG = replace(ROBOTS["kobuki"], name="big", radius=0.35)
     ],
 )  # fmt: skip
 def test_a_policy_for_another_robot_is_warned_of(
-    policy: Any, robot: str | RobotModel, message: str
+    policy: Any, robot: RobotChoice, message: str
 ) -> None:
     with pytest.warns(UserWarning, match=message):
         evaluate(policy, "A", episodes=1, physics="kinematic", robot=robot, max_steps=2)

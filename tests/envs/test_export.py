@@ -18,7 +18,7 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.layers import Choice, Clip, Linear, ReLU, Scale, Table, Tanh
 from mpfa_envs.policies.policy import PolicyFileError
 from mpfa_envs.sensing.binning import Binning
-from tests.envs.exported import ENV_ARGUMENTS, SHIPPED, exported, make_policy
+from tests.envs.exported import SHIPPED, exported, make_policy
 
 
 def observations(count: int = 1000, size: int = 24) -> np.ndarray:
@@ -98,7 +98,8 @@ def test_the_card_says_what_a_robot_must_know(tmp_path: Path) -> None:
     assert card["limits"]["period"] == 0.2 and card["robot"]["wheel_base"] == 0.23
     assert card["training"] == {"seed": 3} and card["results"] == [{"success": 0.9}]
     loaded = load_policy(file)
-    assert (loaded.card, loaded.env_arguments) == ({"seed": 3}, ENV_ARGUMENTS)
+    assert (loaded.card, loaded.env_arguments) == ({"seed": 3}, make_policy().env_arguments)
+    assert loaded.env_arguments["robot"] == card["robot"]
 
 
 def test_the_same_policy_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -129,7 +130,7 @@ def test_a_policy_of_other_layers_or_senses_is_not_exported(tmp_path: Path) -> N
         ({"memory": "map"}, "observation.size must be 27"),
         ({"memory": "long"}, "memory must be"),
         ({"history": -1}, "history must be an integer of at least 0, got -1"),
-        ({"robot": {}}, "the card does not fit: .*missing"),
+        ({"robot": {}}, "the card does not fit: robot must have all its fields"),
         ({"limits": {}}, "the card has no 'period'"),
         ({"scales": {"goal_closeness_distance": 0.4}}, "goal_closeness_distance must be 0.3"),
         ({"observation": {"size": 12}, "lidar": {}}, "the card has no 'sectors'"),

@@ -99,7 +99,7 @@ TASK: Rows = [
     ({"lidar": {"reduction": "mean"}}, "reduction must be one of .*got 'mean'"),
     ({"lidar": {"max_range": -1.0}}, r"max_range must be positive, got -1\.0"),
     ({"lidar": {"noise": -1.0}}, r"noise must not be negative, got -1\.0"),
-    ({"lidar": {"sector": 3}}, "lidar must hold arguments of Lidar, got {'sector': 3}"),
+    ({"lidar": {"sector": 3}}, "lidar must hold arguments of Lidar, got {.*'sector': 3"),
     ({"lidar": 18}, "lidar must hold arguments of Lidar, got 18"),
     (
         {"lidar": {"noise": 0.1}, "noise": {"range_noise": 0.1}},
@@ -193,7 +193,7 @@ PILOT: Rows = [
     ({"robot": "burger", "pace": 0.5}, "pace must be above 0 and at most 0.44, as burger"),
     ({"pace": 0.0}, "pace must be above 0"),
     ({"silent": "near"}, "silent must be one of"),
-    ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, got 2"),
+    ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, .*got 2"),
     ({"unseen": -1.0}, "unseen must be positive, got -1.0"),
     ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
 ]

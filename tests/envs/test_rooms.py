@@ -14,13 +14,12 @@ from mpfa_envs import (
     ROBOTS,
     ROOMS_TASK,
     NavigationEnv,
-    RobotModel,
     TaskConfig,
     VectorNavigationEnv,
     generate_world,
 )
 from mpfa_envs.generators.generate import generator_tasks
-from mpfa_envs.robots.model import resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.observation import INFO_TYPES
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
@@ -51,7 +50,7 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
 
 
 @pytest.mark.parametrize("robot", [*ROBOTS, replace(ROBOTS["kobuki"], name="cart", radius=0.28)])
-def test_the_task_keeps_its_clearance_of_the_rim_of_each_robot(robot: str | RobotModel) -> None:
+def test_the_task_keeps_its_clearance_of_the_rim_of_each_robot(robot: RobotChoice) -> None:
     task = TaskConfig(
         **{name: ROOMS_TASK[name] for name in ROOMS_TASK.keys() - {"world", "max_goal_distance"}},
         robot=robot,

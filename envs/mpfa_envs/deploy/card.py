@@ -45,7 +45,7 @@ _ENTRIES: Final[Mapping[str, tuple[str, Callable[[str, Any], Any]]]] = {
     "closeness_distance": ("scales.closeness_distance", check_positive),
     "memory": ("memory", partial(check_choice, kinds=Memory)),
     "history": ("history", partial(check_count, least=0)),
-    "robot": ("robot", lambda _, values: RobotModel(**values)),
+    "robot": ("robot", lambda _, values: RobotModel.from_fields(values)),
     "period": ("limits.period", check_positive),
     "goal_radius": ("limits.goal_radius", check_positive),
     "env_arguments": ("env_arguments", lambda _, values: dict(values)),

@@ -12,7 +12,8 @@ from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
 from mpfa_envs.sensing.observation_loops import observe_all
@@ -65,11 +66,12 @@ class Pilot:
     Args:
         card: Of the policy.
         network: From observations ``[1, O]`` to actions ``[1, 2]``.
-        robot: What drives, a name or a :class:`~mpfa_envs.RobotModel`; None: the robot that the
-            policy learned with.
+        robot: What drives, as any environment takes it; None: the robot that the policy learned
+            with.
         pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can, so
             that it turns, accelerates and brakes as the policy learned.
-        mount: Position of the lidar, as for :class:`~mpfa_envs.deploy.Sectors`.
+        mount: Position of the lidar, as for :class:`~mpfa_envs.deploy.Sectors`; None: that of the
+            robot, its ``lidar_mount``.
         unseen: As there.
         silent: As there.
         map_size: Side of the map of a policy that has one [m], a square around the robot's first
@@ -88,9 +90,9 @@ class Pilot:
         card: Card,
         network: Callable[[NDArray[np.float32]], NDArray[np.float32]],
         *,
-        robot: str | RobotModel | None = None,
+        robot: RobotChoice | None = None,
         pace: float | None = None,
-        mount: tuple[float, ...] = (0.0, 0.0, 0.0),
+        mount: tuple[float, ...] | None = None,
         unseen: float | None = None,
         silent: Silent = "reject",
         map_size: float = 40.0,
@@ -120,6 +122,7 @@ class Pilot:
                 f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
                 "policy with it, or give a lower min_wheel_speed if its wheels can do that"
             )
+        mount = self.robot.lidar_mount if mount is None else mount
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_choice, check_positive
-from mpfa_envs.deploy.card import check_finite
+from mpfa_envs.robots.model import check_mount
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -19,8 +19,6 @@ Silent = Literal["reject", "far"]
 """Reading of a sector without a valid ray: the scan is rejected, or nothing is there."""
 _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
-_LEVEL = math.radians(10.0)
-"""Roll up to which a scan counts as level [rad]."""
 _OFF = 1.5
 """Increments by which ``angle_max`` may miss the last ray: some drivers count one more."""
 _NEAR = 0.08
@@ -123,10 +121,8 @@ class Sectors:
         silent: Silent = "reject",
     ) -> None:
         self.card = card
-        *place, roll = (*check_finite("mount", mount, max(min(len(mount), 4), 3)), 0.0)[:4]
+        *place, roll = (*check_mount("mount", mount), 0.0)[:4]
         self.mount = tuple(place)
-        if min(abs(roll), abs(abs(roll) - math.pi)) > _LEVEL:
-            raise ValueError(f"mount must have a roll of 0 or π, as scans are level, got {roll}")
         self._side = 1.0 if abs(roll) < 1.0 else -1.0
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
         self.silent: Silent = check_choice("silent", silent, Silent)

@@ -20,14 +20,9 @@ from mpfa_envs.checks import (
     check_share,
 )
 from mpfa_envs.robots.drives import Physics
-from mpfa_envs.robots.model import (
-    PAPER_CLEARANCE,
-    ROBOTS,
-    TRAINING_CLEARANCE,
-    RobotModel,
-    resolve_robot,
-)
+from mpfa_envs.robots.model import PAPER_CLEARANCE, ROBOTS, TRAINING_CLEARANCE, RobotModel
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
+from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
@@ -70,17 +65,26 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "detour_chance": check_share,
 }
 _EMPTY: Final = World(name="empty")
-_AHEAD: Final = 180.0
-"""The field of view that a lidar has by default [deg]."""
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
 _DESCRIBED: Final = ("robot", "clearance", "contact", "reward", "progress_scale", "lidar")
 """Fields that a description has in another form."""
+_MOST_RAYS: Final = 3
+"""Rays of a sector in training; the nearest of more differs little, and each takes time."""
 _PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale", "step_cost")
 
 
 def lidar_arguments(field_of_view: float) -> dict[str, Any]:
     """Arguments of a lidar with a field of view [deg] in sectors of 10 degrees."""
     return {"field_of_view": field_of_view, "sectors": max(round(field_of_view / 10.0), 1)}
+
+
+def lidar_of(robot: RobotModel) -> dict[str, Any]:
+    """Arguments of the lidar of a robot: at most three rays in each sector, and at least one."""
+    found = lidar_arguments(robot.field_of_view)
+    if robot.lidar_rays is not None:
+        found["sectors"] = min(found["sectors"], robot.lidar_rays)
+        found["rays_per_sector"] = min(robot.lidar_rays // found["sectors"], _MOST_RAYS)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +109,8 @@ class TaskConfig:
     """
 
     robot: RobotModel = ROBOTS["turtlebot2"]
-    """A :class:`~mpfa_envs.RobotModel`, or a name in :data:`~mpfa_envs.ROBOTS`."""
+    """A :class:`~mpfa_envs.RobotModel`, its fields by name, the path of a YAML file
+    (:func:`~mpfa_envs.load_robot`), or a name in :data:`~mpfa_envs.ROBOTS`."""
     physics: Physics = "wheels"
     """``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on exact arcs,
     several times faster, and needs no PyBullet. Lidar, clearance and collisions are computed from
@@ -137,8 +142,8 @@ class TaskConfig:
     fast. Another function pays as it likes; with ``progress="none"`` it gets the straight
     distances."""
     lidar: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``. Unless
-    they say so, the field of view is that of the robot, in sectors of 10 degrees."""
+    """Arguments of :class:`~mpfa_envs.Lidar`, ``{"noise": 0.02}``. Unless they say so, range, rays
+    and field of view are the robot's, in sectors of 10 degrees."""
     memory: Memory = "none"
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
@@ -204,9 +209,9 @@ class TaskConfig:
         if not isinstance(self.lidar, Mapping | None):
             raise ValueError(f"lidar must hold arguments of Lidar, got {self.lidar!r}")
         arguments = dict(self.lidar or {})
-        view = self.robot.field_of_view
-        if view != _AHEAD and not {"field_of_view", "sectors"} & set(arguments):
-            arguments |= lidar_arguments(view)
+        if not {"field_of_view", "sectors"} & set(arguments):
+            arguments = lidar_of(self.robot) | arguments
+        arguments.setdefault("max_range", self.robot.lidar_range)
         for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
             if value > 0.0:
                 if name in arguments:
@@ -309,7 +314,12 @@ class TaskConfig:
         described["collision_distance"] = self.collision_distance
         robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
-        described.update({f"robot.{name}": value and float(value) for name, value in robot.items()})
+        described.update(
+            # The lidar is described below, as the task has it.
+            (f"robot.{name}", value and float(value))
+            for name, value in robot.items()
+            if not name.startswith("lidar_")
+        )
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):

@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from typing import Any, Protocol, runtime_checkable
@@ -21,7 +21,8 @@ from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, 
 from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.tasks.sets import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
@@ -271,7 +272,9 @@ def _warn_of_another_robot(policy: Action | Driver, robot: RobotModel) -> None:
     made_for = getattr(policy, "env_arguments", {}).get("robot")
     for what, given in (("policy", made_for), ("filter", getattr(policy, "keep", None))):
         named = getattr(given, "robot", given)
-        if not isinstance(named, (str, RobotModel)) or (other := resolve_robot(named)) == robot:
+        if not isinstance(named, (str, os.PathLike, Mapping, RobotModel)):
+            continue
+        if (other := resolve_robot(named)) == robot:
             continue
         both = zip(asdict(other).items(), asdict(robot).values(), strict=True)
         differ = ", ".join(f"{n} {one} and {two}" for (n, one), two in both if one != two)

@@ -12,7 +12,7 @@ from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import MapPlanner
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search, astar_path, dijkstra_path, path_length
-from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.sensing.observation import Memory
 
 __all__ = [
@@ -45,7 +45,7 @@ _COARSE: Final = 0.2
 def make_planner(
     name: str,
     *,
-    robot: str | RobotModel = "turtlebot2",
+    robot: RobotChoice = "turtlebot2",
     memory: Memory = "none",
     seed: int = 0,
 ) -> MapPlanner | DynamicWindow:

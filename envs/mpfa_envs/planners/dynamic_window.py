@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.env.config import TaskConfig
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.observation import DISTANCE_SCALE, Memory, observation_slices
 
@@ -112,7 +113,7 @@ class DynamicWindow:
     def __init__(
         self,
         *,
-        robot: str | RobotModel = "turtlebot2",
+        robot: RobotChoice = "turtlebot2",
         memory: Memory = "none",
         sectors: int | None = None,
         max_range: float = 10.0,
@@ -175,7 +176,7 @@ class DynamicWindow:
         self._lines = self._steps[:, None] * directions[:, None]
         self.memory = memory
         self.env_arguments: dict[str, Any] = {
-            "robot": robot,
+            "robot": self.robot,
             "physics": "kinematic",
             "memory": memory,
             "closeness_distance": self.closeness_distance,

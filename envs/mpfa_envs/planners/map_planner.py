@@ -13,7 +13,8 @@ from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.paths.distance import MANY_CELLS, FreeGrid
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search
-from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel, resolve_robot
+from mpfa_envs.robots.model import TRAINING_CLEARANCE
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.worlds.shapes import Point
 from mpfa_envs.worlds.world import World
 
@@ -54,7 +55,7 @@ class MapPlanner:
         self,
         search: Search,
         *,
-        robot: str | RobotModel = "turtlebot2",
+        robot: RobotChoice = "turtlebot2",
         clearance: float = TRAINING_CLEARANCE,
         resolution: float = 0.1,
         look_ahead: float = 0.6,
@@ -64,7 +65,7 @@ class MapPlanner:
         self.clearance = check_positive("clearance", clearance)
         self.resolution = check_positive("resolution", resolution)
         self.look_ahead = check_positive("look_ahead", look_ahead)
-        self.env_arguments: dict[str, Any] = {"robot": robot, "physics": "kinematic"}
+        self.env_arguments: dict[str, Any] = {"robot": self.robot, "physics": "kinematic"}
         """Arguments of the environments that it drives in, unless others are given."""
         self._pursuits: dict[int, PurePursuit] = {}
         self._grids: dict[tuple[float, float], FreeGrid] = {}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from mpfa_envs.policies.layers import Layer, check_layers, from_torch
+from mpfa_envs.robots.resolve import resolve_robot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +30,7 @@ class Policy:
         card: Plain values that say what it is: how it was trained, what it can do.
         env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv` under which it senses and
             acts as it learned to: robot, physics, time limit, action repeat, closeness distance.
+            The robot, however it is given, is kept as its fields.
 
     Raises:
         ValueError: If the layers do not fit together, a weight is not finite, or the card or the
@@ -52,7 +55,11 @@ class Policy:
         self.observation_size, self.action_size = check_layers(layers)
         self.layers = tuple(layers)
         self.card: dict[str, Any] = _plain("card", card or {})
-        self.env_arguments: dict[str, Any] = _plain("env_arguments", env_arguments or {})
+        arguments = dict(env_arguments or {})
+        if "robot" in arguments:
+            # Its fields, so that a policy does not depend on a file, or on what a name stands for.
+            arguments["robot"] = asdict(resolve_robot(arguments["robot"]))
+        self.env_arguments: dict[str, Any] = _plain("env_arguments", arguments)
 
     @classmethod
     def from_layers(

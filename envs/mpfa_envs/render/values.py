@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.render.grids import Heading, fill_cells, observe_room
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.scene.canvas import FINE, Canvas, Point
 from mpfa_envs.scene.colors import ROBOT_FRONT, TEXT, shares_of
 from mpfa_envs.scene.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Final
+from dataclasses import MISSING, dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_number, check_positive, did_you_mean
+from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ PAPER_CLEARANCE: Final = 0.17
 
 A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
 """
+
+_LEVEL: Final = math.radians(10.0)
+"""Greatest roll of a lidar that counts as level [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,12 @@ class RobotModel:
         field_of_view: Angle that its lidar sees, which its front halves [deg]. The default does not
             fit a robot that reverses: filter, dynamic window and pilot keep it from driving where
             it does not see. Give 360.
+        lidar_rays: Rays of a scan over that angle. Training casts as many in each of the sectors
+            of 10 degrees, but at most three; None: three.
+        lidar_range: A ray that meets nothing within this distance reports this distance [m].
+        lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
+            [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. A pilot reads
+            scans by it; in training rays begin at the robot's center.
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
@@ -71,12 +80,20 @@ class RobotModel:
     wheel_acceleration: float | None = None
     turn_limit: float | None = None
     field_of_view: float = 180.0
+    lidar_rays: int | None = None
+    lidar_range: float = 10.0
+    lidar_mount: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
+        object.__setattr__(self, "lidar_mount", check_mount("lidar_mount", self.lidar_mount))
+        if self.lidar_rays is not None:
+            check_count("lidar_rays", self.lidar_rays)
         for field in fields(self)[1:]:
             value = getattr(self, field.name)
+            if field.name in ("lidar_rays", "lidar_mount"):
+                continue
             if value is None and field.name in ("wheel_acceleration", "turn_limit"):
                 continue
             if not isinstance(value, (int, float)):
@@ -98,6 +115,29 @@ class RobotModel:
             )
         if self.field_of_view > 360.0:
             raise ValueError(f"field_of_view must be at most 360 degrees, got {self.field_of_view}")
+
+    @classmethod
+    def from_fields(cls, values: Mapping[str, Any]) -> RobotModel:
+        """Make a robot of its fields by name, as ``dataclasses.asdict`` and policies have them.
+
+        Args:
+            values: The fields; those with a default may be left out.
+
+        Returns:
+            The robot.
+
+        Raises:
+            ValueError: If a field is unknown, missing or out of its range.
+        """
+        known = {field.name: field.default is MISSING for field in fields(cls)}
+        for name in values:
+            if name not in known:
+                hint = did_you_mean(name, known) or f"known are {', '.join(known)}"
+                raise ValueError(f"robot must have fields of RobotModel, got {name!r}; {hint}")
+        missing = [name for name, needed in known.items() if needed and name not in values]
+        if missing:
+            raise ValueError(f"robot must have all its fields, got none for {', '.join(missing)}")
+        return cls(**values)
 
     @property
     def max_angular_speed(self) -> float:
@@ -189,6 +229,22 @@ class RobotModel:
                 f' rpy="{-math.pi / 2} 0 0"/><axis xyz="0 0 1"/></joint>',
             ]
         return "\n".join([*parts, "</robot>"])
+
+
+def check_mount(name: str, mount: Any) -> tuple[float, ...]:
+    """Check a pose (x, y, yaw) of a level lidar, or one with its roll [m, m, rad, rad]."""
+    try:
+        found = tuple(check_number(name, value) for value in mount)
+    except TypeError:
+        raise ValueError(f"{name} must be a list [x, y, yaw], got {mount!r}") from None
+    if len(found) not in (3, 4):
+        raise ValueError(
+            f"{name} must be 3 numbers, x, y [m] and yaw [rad], or 4 with a roll, got {len(found)}"
+        )
+    roll = abs(found[3]) if found[3:] else 0.0
+    if min(roll, abs(roll - math.pi)) > _LEVEL:
+        raise ValueError(f"{name} must have a roll of 0 or π, as scans are level, got {found[3]}")
+    return found
 
 
 def _inertial(mass: float, moments: tuple[float, float, float], *, z: float) -> str:
@@ -287,13 +343,3 @@ ROBOTS: Final[Mapping[str, RobotModel]] = {
     )
 }
 """The robots known by name: the paper's, and some as they are sold."""
-
-
-def resolve_robot(robot: str | RobotModel) -> RobotModel:
-    """Look a robot up by name; a :class:`RobotModel` is returned as it is."""
-    if isinstance(robot, RobotModel):
-        return robot
-    if isinstance(robot, str) and robot in ROBOTS:
-        return ROBOTS[robot]
-    hint = f" ({question})" if (question := did_you_mean(robot, ROBOTS)) else ""
-    raise ValueError(f"robot must be a RobotModel or one of {sorted(ROBOTS)}, got {robot!r}{hint}")

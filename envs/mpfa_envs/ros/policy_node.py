@@ -60,7 +60,7 @@ class PolicyNode(Node):
             value("policy"),
             robot=value("robot") or None,
             pace=value("pace") or None,
-            mount=tuple(value("mount")),
+            mount=tuple(value("mount")) if any(value("mount")) else None,
             unseen=value("unseen") or None,
             clearance=value("clearance") or None,
             **options,

@@ -12,7 +12,7 @@ from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.sectors import Scan
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.drives import Physics, make_drives
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.lidar import Lidar
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class SimulatedRobot:
         self,
         world: str | os.PathLike[str] | World = "test",
         *,
-        robot: str | RobotModel = "turtlebot2",
+        robot: RobotChoice = "turtlebot2",
         physics: Physics = "wheels",
         time_step: float = 0.1,
         rays: int = 360,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_not_negative, check_positive
-from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import Body, filter_actions
 from mpfa_envs.sensing.observation import Memory, observation_slices
 
@@ -70,7 +70,7 @@ class SafetyFilter:
 
     def __init__(
         self,
-        robot: str | RobotModel,
+        robot: RobotChoice,
         *,
         angles: NDArray[np.float64],
         sectors: int,

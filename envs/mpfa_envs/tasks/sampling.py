@@ -14,7 +14,8 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
-from mpfa_envs.robots.model import PAPER_CLEARANCE, RobotModel, resolve_robot
+from mpfa_envs.robots.model import PAPER_CLEARANCE
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.worlds.task import START_SLACK, Task
 from mpfa_envs.worlds.world import Box, World
 
@@ -199,7 +200,7 @@ def evaluation_pairs(
     n: int,
     seed: int,
     *,
-    robot: str | RobotModel = "turtlebot2",
+    robot: RobotChoice = "turtlebot2",
     min_goal_distance: float = 2.0,
 ) -> list[Task]:
     """Sample a fixed list of tasks, the same for everyone with the same arguments.

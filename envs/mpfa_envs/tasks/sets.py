@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, cast, get_args
 from mpfa_envs.checks import check_count, did_you_mean
 from mpfa_envs.generators.generate import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.barn import barn_task, barn_worlds, load_barn
 from mpfa_envs.worlds.task import Task
@@ -62,7 +62,7 @@ def world_tasks(
     *,
     episodes: int | None = None,
     seed: int = 0,
-    robot: str | RobotModel = "turtlebot2",
+    robot: RobotChoice = "turtlebot2",
 ) -> list[WorldTask]:
     """Make the tasks of a name, the same for everyone.
 

@@ -30,7 +30,7 @@ from PIL import Image
 from mpfa_envs.files import read_file
 from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE
-from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, read_nodes
+from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError
 
 Mode = Literal["trinary", "scale", "raw"]
 """Meanings of shades between the thresholds."""
@@ -72,8 +72,8 @@ def read_map(
     """Read the cells of a map of ROS."""
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
-    root = read_nodes(path) if root is None else root
     reader = _Reader(path)
+    root = reader.read() if root is None else root
     entries = reader.mapping(root, "the file", _KEYS)
     for key in _KEYS[:-1]:
         if key not in entries:
@@ -148,7 +148,7 @@ class _Reader(NodeReader):
         super().__init__(path)
         self.misspelt: list[str] = []
 
-    def unknown(self, error: WorldFileError, hint: str, keys: tuple[str, ...]) -> None:
+    def unknown(self, error: ValueError, hint: str, keys: tuple[str, ...]) -> None:
         """Ignore a key of another tool, as map_server does, and keep one that looks misspelt."""
         if hint:
             self.misspelt.append(f"{error}; {hint}")

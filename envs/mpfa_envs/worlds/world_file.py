@@ -18,7 +18,7 @@ from mpfa_envs.worlds.ros_map import read_map
 from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
 from mpfa_envs.worlds.walker import Walker
 from mpfa_envs.worlds.world import World
-from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, is_map, parse_nodes, read_nodes
+from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, is_map
 
 _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
     "boxes": ("x_min", "x_max", "y_min", "y_max"),
@@ -59,16 +59,18 @@ def load_world(path: str | os.PathLike[str]) -> World:
         ('example', 4, 3)
     """
     path = Path(path)
-    root = read_nodes(path)
+    reader = _Reader(path)
+    root = reader.read()
     if is_map(root):
         grid = read_map(path, root)
         return World(name=path.stem, size=grid.size, occupancy=grid)
-    return _Reader(path).world(root)
+    return reader.world(root)
 
 
 def _load(path: Path) -> World:
     """Read a world that is no map, which another function writes."""
-    return _Reader(path).world(read_nodes(path))
+    reader = _Reader(path)
+    return reader.world(reader.read())
 
 
 class _Reader(NodeReader):
@@ -231,7 +233,8 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
     path, encoded = Path(path), text.encode()
     try:
-        _Reader(path).world(parse_nodes(encoded, path))
+        reader = _Reader(path)
+        reader.world(reader.parse(encoded))
     except WorldFileError as error:
         raise ValueError(f"world must be one that can be loaded again: {error}") from error
     check_replaceable(path, _load, "world", overwrite=overwrite)

@@ -32,35 +32,6 @@ class WorldFileError(ValueError):
     """A file does not describe a world; the message names the file and the line."""
 
 
-def read_nodes(path: Path) -> yaml.Node | None:
-    """Read a file as nodes, which have line numbers and never run code."""
-    try:
-        content = read_file(path, _LARGEST_FILE)
-    except OSError as error:
-        raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    return parse_nodes(content, path)
-
-
-def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
-    """Turn the content of a file into nodes; a map is read as tolerantly as by yaml-cpp."""
-    if len(content) > _LARGEST_FILE:  # A file to be written has not been checked.
-        raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
-    try:
-        text = _decoded(content)
-        if _IMAGE.search(text):
-            return next(yaml.compose_all(text.replace("\t", " "), Loader=yaml.SafeLoader), None)
-        return yaml.compose(content.decode(), Loader=yaml.SafeLoader)
-    except UnicodeDecodeError as error:
-        text = f"{path}: is not UTF-8: {error}; a world is read from {KINDS}"
-        raise WorldFileError(text) from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
-    except RecursionError:
-        raise WorldFileError(f"{path}: is nested too deeply") from None
-
-
 def _decoded(content: bytes) -> str:
     """Read UTF-8, or else what has a mark of UTF-16 or an older encoding, as in a comment."""
     try:
@@ -88,20 +59,53 @@ def is_map(root: yaml.Node | None) -> bool:
 class NodeReader:
     """Reads values from the nodes of one file."""
 
+    failure: type[ValueError] = WorldFileError
+    """What is raised; the message names the file and the line."""
+    hint = f"a world is read from {KINDS}"
+    """What the file should be, for a file that is something else."""
+
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def error(self, node: yaml.Node | None, text: str) -> WorldFileError:
+    def read(self) -> yaml.Node | None:
+        """Read the file as nodes, which have line numbers and never run code."""
+        try:
+            content = read_file(self.path, _LARGEST_FILE)
+        except OSError as error:
+            raise self.failure(f"{self.path}: cannot be read: {error}") from error
+        return self.parse(content)
+
+    def parse(self, content: bytes) -> yaml.Node | None:
+        """Turn the content of a file into nodes; a map is read as tolerantly as by yaml-cpp."""
+        if len(content) > _LARGEST_FILE:  # A file to be written has not been checked.
+            raise self.failure(f"{self.path}: has more than {_LARGEST_FILE} bytes")
+        try:
+            text = _decoded(content)
+            if _IMAGE.search(text):
+                spaced = text.replace("\t", " ")
+                return next(yaml.compose_all(spaced, Loader=yaml.SafeLoader), None)
+            return yaml.compose(content.decode(), Loader=yaml.SafeLoader)
+        except UnicodeDecodeError as error:
+            raise self.failure(f"{self.path}: is not UTF-8: {error}; {self.hint}") from error
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            where = f"{self.path}:{mark.line + 1}" if mark else str(self.path)
+            problem = getattr(error, "problem", error)
+            raise self.failure(f"{where}: is not YAML: {problem}") from error
+        except RecursionError:
+            raise self.failure(f"{self.path}: is nested too deeply") from None
+
+    def error(self, node: yaml.Node | None, text: str) -> ValueError:
         """An error at the line of a node."""
         line = node.start_mark.line + 1 if node else 1
-        return WorldFileError(f"{self.path}:{line}: {text}")
+        return self.failure(f"{self.path}:{line}: {text}")
 
     def mapping(
         self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
     ) -> dict[str, yaml.Node]:
         """Read a mapping that has no key twice, and as :meth:`unknown` says no others."""
         if not isinstance(node, yaml.MappingNode):
-            hint = f"; a world is read from {KINDS}" if what == "the file" else ""
+            hint = f"; {self.hint}" if what == "the file" else ""
             text = f"{what} must be a mapping with the keys {', '.join(keys)}{hint}"
             raise self.error(node, text)
         entries: dict[str, yaml.Node] = {}
@@ -116,9 +120,9 @@ class NodeReader:
             entries[name] = value
         return entries
 
-    def unknown(self, error: WorldFileError, hint: str, keys: tuple[str, ...]) -> None:
+    def unknown(self, error: ValueError, hint: str, keys: tuple[str, ...]) -> None:
         """Reject an unknown key; the hint is the nearest known one, if any is near."""
-        raise WorldFileError(f"{error}; {hint or 'known are ' + ', '.join(keys)}")
+        raise self.failure(f"{error}; {hint or 'known are ' + ', '.join(keys)}")
 
     def items(self, node: yaml.Node, what: str) -> list[yaml.Node]:
         """Read a list."""

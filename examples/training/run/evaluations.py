@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from tensordict.nn import TensorDictModule
 
-from mpfa_envs import Policy, WorldTask, run_tasks, world_tasks
+from mpfa_envs import Policy, RobotModel, WorldTask, run_tasks, world_tasks
+from mpfa_envs.robots.resolve import resolve_robot
 from training.environments import env_arguments
 from training.evaluating import Drivable, filtered
 from training.records import EvaluationRecord, last_best
@@ -79,7 +80,7 @@ def evaluate_policy(
     start = time.perf_counter()
     wanted, exported = settings.evaluation, exported_policy(policy, settings)
     driver: Drivable = filtered(exported) if _always_filtered(settings) else exported
-    tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
+    tasks = _tasks(wanted.world, wanted.episodes, resolve_robot(settings.environment.robot))
     results = run_tasks(driver, tasks, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl", "sct")
     return EvaluationRecord(
@@ -93,6 +94,6 @@ def evaluate_policy(
 
 
 @lru_cache(maxsize=4)
-def _tasks(world: str, episodes: int, robot: str) -> list[WorldTask]:
+def _tasks(world: str, episodes: int, robot: RobotModel) -> list[WorldTask]:
     """The tasks of each evaluation, with worlds whose shortest paths are known from the second."""
     return world_tasks(world, episodes=episodes, seed=SEED, robot=robot)

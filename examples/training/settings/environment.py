@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE
 from training.settings.rules import at_least, between, setting
@@ -28,9 +29,10 @@ class NoiseSettings:
 class EnvironmentSettings:
     """The navigation task."""
 
-    robot: str = "turtlebot2"
+    robot: Any = "turtlebot2"
     """``turtlebot2``, the paper's, which can neither stop nor reverse; ``kobuki``, the same body
-    with its real wheels, ``turtlebot4``, ``burger`` or ``waffle``."""
+    with its real wheels, ``turtlebot4``, ``burger`` or ``waffle``; or the path of a YAML file of
+    your own (``docs/howto/robot.md``), whose values a run keeps in its place."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500

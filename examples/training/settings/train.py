@@ -382,6 +382,16 @@ def _plain(stages: Sequence[Any]) -> list[Stage]:
     return [Stage(each.world, each.episodes, each.actions) for each in stages]
 
 
+def _without_file(robot: Any) -> Any:
+    """Return a robot's name as it is, and the values of a file in its place."""
+    from mpfa_envs.robots.resolve import is_robot_file, resolve_robot
+
+    if isinstance(robot, str) and not is_robot_file(robot):
+        return robot
+    with named("environment.robot: "):
+        return asdict(resolve_robot(robot))
+
+
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     """Return typed settings from Hydra's composition or a checkpoint."""
     values = OmegaConf.create(config) if isinstance(config, dict) else config.copy()
@@ -402,6 +412,7 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     with named("method."):
         settings = OmegaConf.to_object(merged)
     assert isinstance(settings, TrainSettings)
+    settings.environment.robot = _without_file(settings.environment.robot)
     curriculum = settings.curriculum
     curriculum.name = curriculum.name or curriculum_name(curriculum.stages)
     if settings.evaluation.world == SAME and curriculum.stages:
