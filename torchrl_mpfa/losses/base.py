@@ -52,6 +52,8 @@ VALUE = "value"
 DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
 KNOWN_SIGNALS = (*DEFAULT_SIGNALS, VALUE, INFORMATION_GAIN.name)
 """Signals that a loss can write."""
+_LEAST_SLOPE = 1e-19
+"""Its square is still a normal number in single precision."""
 _ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
@@ -238,7 +240,8 @@ class SignalLoss(HoldsNetworks):
 
         A transition's action enters the loss through its own Q alone, so
         :math:`\nabla_a Q = \nabla_a L / (\partial L / \partial Q)`: the backward pass of the loss
-        gives both factors, and no pass of its own is needed.
+        gives both factors, and no pass of its own is needed. A transition without error counts as
+        one with the least error that can be divided by.
 
         Args:
             tensordict: The batch of the loss; nothing is written if nothing was deferred.
@@ -253,16 +256,7 @@ class SignalLoss(HoldsNetworks):
             raise RuntimeError(
                 "the action gradient was deferred: call backward() on the loss first"
             )
-        slope = value.grad[0].unsqueeze(-1)
-        gradient = action.grad / slope
-        flat = slope == 0
-        if bool(flat.any()):  # Where there is no error there is nothing to divide.
-            stored, keys = self._stored(tensordict), self.tensor_keys
-            action = stored[keys.action].requires_grad_(True)
-            with torch.enable_grad():
-                found = self._networks().frozen_critics[0].outputs(stored)
-                own = action_gradient(found[keys.state_action_value].squeeze(-1), action)
-            gradient = torch.where(flat, own, gradient)
+        gradient = action.grad / value.grad[0].unsqueeze(-1)
         self._write_slope(tensordict, gradient)
 
     def keep_target_critics(self) -> None:
@@ -356,6 +350,7 @@ class SignalLoss(HoldsNetworks):
         if ACTION_GRADIENT.name not in self.signals:
             return
         if defer and torch.is_grad_enabled():
+            value.register_hook(_without_zeros)
             value.retain_grad()
             self._deferred = action, value
         else:
@@ -436,3 +431,8 @@ class SignalLoss(HoldsNetworks):
         """Return critics that hold the parameters with this prefix, without gradients."""
         name = self._critic_name
         return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
+
+
+def _without_zeros(slope: Tensor) -> Tensor:
+    """Replace zeros by a number that moves no weight, and that can be divided by."""
+    return slope.masked_fill(slope == 0, max(_LEAST_SLOPE, torch.finfo(slope.dtype).tiny))
