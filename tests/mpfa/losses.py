@@ -20,7 +20,7 @@ from torchrl_mpfa import (
     make_td3_loss,
     make_value_network,
 )
-from torchrl_mpfa.learners.compiled import CompiledGradients
+from torchrl_mpfa.learners.compiled import CompiledUpdate
 from torchrl_mpfa.networks import StochasticActor
 
 GAMMA = 0.9
@@ -136,4 +136,8 @@ def differentiate_at_once(loss, batch, *, trains="both", loss_function=None):
     """Set gradients and write signals by the trace that a compiled update is made of."""
     for parameter in loss.parameters():
         parameter.grad = None
-    return CompiledGradients(loss, {"disable": True})(batch, trains, loss_function)
+    state = deepcopy(loss.state_dict())
+    # A program takes no steps of RAdam, but gives the gradients.
+    learner = ActorCriticLearner(loss, optimizer="radam")
+    loss.load_state_dict(state)  # A learner sets the targets to the networks.
+    return CompiledUpdate(learner, {"disable": True})(batch, trains, loss_function)[0]

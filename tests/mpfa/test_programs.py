@@ -3,9 +3,11 @@
 import copy
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
 from tests.mpfa.compiled import assert_alike, counting, fail_with, make_pair, update_both
@@ -142,12 +144,12 @@ def test_slices_of_other_tensors_need_no_program_of_their_own():
 def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_losses(monkeypatch):
     asked = []
 
-    def compile(module, inputs, *, options, **_):
-        asked.append((torch.is_grad_enabled(), options["config_patches"]["fallback_random"]))
-        return module.forward
+    def compile(module, inputs, **_):
+        asked.append((torch.is_grad_enabled(), config.fallback_random))
+        return SimpleNamespace(current_callable=lambda values: module.forward(*values))
 
     monkeypatch.setattr(program, "_COMPILED", {})
-    monkeypatch.setattr(program, "standalone_compile", compile)
+    monkeypatch.setattr(program, "compile_fx_inner", compile)
     learners = make_pair("td3", True, policy_delay=1)
     for seed in range(3):
         update_both(learners, seed)

@@ -15,11 +15,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.learners.compiled import CompiledGradients
+from torchrl_mpfa.learners.adam import FlatAdam
+from torchrl_mpfa.learners.compiled import CompiledUpdate
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, Trains
@@ -83,13 +83,30 @@ class MultiTensorSoftUpdate(SoftUpdate):
         params = dict(loss.named_parameters())
         buffers = {**params, **dict(loss.named_buffers())}
         pairs = [(p, buffers.get(f"target_{name}")) for name, p in params.items()]
-        pairs = [(online, target) for online, target in pairs if target is not None]
-        self._online, self._target = (list(each) for each in zip(*pairs, strict=True))
-        self._move = get_ema_multi_avg_fn(1.0 - tau)
+        self._pairs = [(online, target) for online, target in pairs if target is not None]
+        self._online, self._target = (list(each) for each in zip(*self._pairs, strict=True))
+        # As TorchRL computes it, to the last bit.
+        self._weight = 1.0 - (1.0 - tau)
 
+    def flatten(self, optimizer: FlatAdam) -> None:
+        """Move the targets of a group of parameters as one tensor."""
+        optimizer.flatten({id(online): target for online, target in self._pairs})
+        groups = [each for each in optimizer.flat_groups if each.followed]
+        done = {id(each) for group in groups for each in group.followed}
+        rest = [pair for pair in self._pairs if id(pair[0]) not in done]
+        self._online = [each.values[: len(each.targets)] for each in groups] + [o for o, _ in rest]
+        self._target = [each.targets for each in groups] + [target for _, target in rest]
+
+    @torch.no_grad()
     def step(self) -> None:
         """Move every target parameter by tau."""
-        self._move(self._target, self._online, 0)
+        torch._foreach_lerp_(self._target, self._online, self._weight)
+
+    def record_step(self, finite: Tensor) -> None:
+        """Move the targets by operations that can be recorded, if the losses are finite."""
+        for target, online in zip(self._target, self._online, strict=True):
+            moved = torch.lerp(target, online, self._weight)
+            target.copy_(torch.where(finite, moved, target))
 
 
 class OptimizedLearner:
@@ -103,6 +120,8 @@ class OptimizedLearner:
         self.optimizer = make_optimizer(optimizer, groups)
         self._rates = [group["lr"] for group in groups]
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
+        self._program: CompiledUpdate | None = None
+        self._flatten()
         self.updates = 0
         """Training steps taken."""
 
@@ -110,20 +129,42 @@ class OptimizedLearner:
         self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
     ) -> dict[str, Tensor]:
         """Step the optimizer, and the target networks with the actor; return the log."""
-        self.optimizer.zero_grad(set_to_none=True)
+        if isinstance(self.optimizer, FlatAdam) and not self.optimizer.holds():
+            self._flatten()
+        stepped = None
         try:
-            log = self._differentiate(batch, trains, loss_function)
+            if self._program is None:
+                self.clear_gradients()
+                values = self._differentiate(batch, trains, loss_function)
+                log = {name: value.detach() for name, value in values.items()}
+            else:
+                log, stepped = self._program(batch, trains, loss_function)
         except RuntimeError as error:
             if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
                 raise
             found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
             forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
             raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
-        check_losses(log, batch)
-        self.optimizer.step()
-        if trains != "critic":
-            self.targets.step()
+        if not stepped:
+            check_losses(log, batch)
+            self.optimizer.step()
+            if trains != "critic":
+                self.targets.step()
         return log
+
+    def clear_gradients(self) -> None:
+        """Let no parameter have a gradient."""
+        for group in self.optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    def _flatten(self) -> None:
+        """Make the parameters of a group views of one tensor, and their targets of another."""
+        if isinstance(self.optimizer, FlatAdam):
+            self.targets.flatten(self.optimizer)
+            self.loss.forget_networks()
+            if self._program is not None:
+                self._program.forget()
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
@@ -254,7 +295,8 @@ class ActorCriticLearner(OptimizedLearner):
         super().__init__(loss, groups, optimizer, tau)
         self.policy: TensorDictModule = loss.actor_network
         arguments = compile if isinstance(compile, dict) else {}
-        self._program = CompiledGradients(loss, arguments) if compile else None
+        if compile:
+            self._program = CompiledUpdate(self, arguments)
 
     def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """Step the networks and the target networks, as far as they are due.
@@ -279,18 +321,16 @@ class ActorCriticLearner(OptimizedLearner):
         trains, due = sampled.trains, updates % self.policy_delay == 0
         if trains == "both" and not due:
             trains = "critic"
-        log = {}
+        log: dict[str, Tensor] = {}
         if trains == "critic" or due:
             log = self._step(sampled.batch, trains, sampled.loss_function)
         self.updates = updates
-        return {key: value.detach() for key, value in log.items()}
+        return log
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         """Set the gradients and return the log; a parameter without a gradient stays as it is."""
-        if self._program is not None:
-            return self._program(batch, trains, loss_function)
         losses, log = self.loss.losses(batch, trains=trains, loss_function=loss_function)
         # The loss of a temperature that is fixed has no gradient.
         torch.autograd.backward([loss for loss in losses.values() if loss.requires_grad])
@@ -309,7 +349,7 @@ DDPGLearner = TD3Learner = SACLearner = ActorCriticLearner
 def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
     """Make the optimizer of this name, which steps all tensors in one call."""
     if name == "adam":
-        return torch.optim.Adam(groups, fused=True)
+        return FlatAdam(groups)
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")

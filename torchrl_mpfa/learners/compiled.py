@@ -1,7 +1,7 @@
-"""Gradients and signals of an update as one compiled program, traced from the losses themselves.
+"""An update as one compiled program, recorded from the eager one.
 
 With networks of a hundred units an update is mostly the cost of calling some five hundred small
-operations, of which ``torch.compile`` makes one. They are recorded while the losses run once, so
+operations, of which ``torch.compile`` makes one. They are recorded while the update runs once, so
 that nothing is said a second time, and a loss or network of a user is in the program, too.
 Learners whose losses record the same operations share one compiled program, as all tensors of a
 loss are inputs of it: a learner of the same settings as one before it is only recorded.
@@ -20,10 +20,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, fx
-from torch._inductor import standalone_compile
+from torch._inductor import config
+from torch._inductor.compile_fx import compile_fx_inner
+from torch._inductor.decomposition import select_decomp_table
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from torchrl_mpfa.learners.adam import FlatAdam, FlatGroup
 from torchrl_mpfa.selection import Trains
 
 Entries = dict[NestedKey, Tensor]
@@ -34,12 +38,14 @@ _COMPILED: dict[Any, Call] = {}
 
 
 class Program(NamedTuple):
-    """Losses with their gradients, for batches of one form."""
+    """An update, for batches of one form."""
 
     call: Call
     """From the entries of a batch and ``state`` to gradients, signals, and values for the log."""
     state: list[Tensor]
-    """Tensors of the loss, and those that it keeps; later updates change them in place."""
+    """Tensors of the learner, and those that its loss keeps; they are changed in place."""
+    stepped: list[FlatGroup] | None
+    """Groups of parameters that the program moves; None if it gives their gradients instead."""
     moved: list[Tensor]
     """Parameters that the gradients belong to."""
     written: list[NestedKey]
@@ -48,39 +54,61 @@ class Program(NamedTuple):
     """Names of the values for the log."""
 
 
-class CompiledGradients:
-    """Differentiates the losses of an update by a program, one for each form of a batch."""
+class CompiledUpdate:
+    """Makes the updates of a learner by a program, one for each form of a batch.
 
-    def __init__(self, loss: Any, compile: dict[str, Any]) -> None:
+    The program takes the steps of Adam and of the target networks as well. Steps of another
+    optimizer, of one with hooks, and of groups of which only a part has gradients are left to the
+    learner: the program then gives gradients.
+    """
+
+    def __init__(self, learner: Any, compile: dict[str, Any]) -> None:
         _keep_programs()
-        self._loss = loss
+        self._learner, self._loss = learner, learner.loss
         self._arguments = compile
         self._programs: dict[Any, Program] = {}
-        self._device = next(loss.parameters()).device.type
+        self._device = next(self._loss.parameters()).device.type
         self._held: list[Any] = []
         self._options: tuple[Any, ...] = ()
 
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
-    ) -> dict[str, Tensor]:
-        """Set gradients and write signals like losses and a backward pass; return the log."""
+    ) -> tuple[dict[str, Tensor], bool]:
+        """Make an update like losses, backward pass and steps do.
+
+        Returns:
+            The log; and True if the steps were taken, which they are not if a loss is not finite,
+            or if they are left to the learner.
+        """
         entries = self._entries(batch)
         self._read_options()
         precision = torch.is_autocast_enabled(self._device) and torch.get_autocast_dtype(
             self._device
         )
-        form = trains, loss_function, precision, self._options, *map(_form, entries.items())
+        steps = _records_steps(self._learner.optimizer)
+        form = trains, loss_function, precision, steps, self._options, *map(_form, entries.items())
         program = self._programs.get(form)
         if program is None:
-            made = self._make(entries, batch.batch_size[:1], trains, loss_function)
+            made = self._make(entries, batch.batch_size[:1], trains, loss_function, steps)
             program = self._programs[form] = made
+        for group in program.stepped or ():
+            group.scale()
         with torch.no_grad():
             found = iter(program.call(*entries.values(), *program.state))
         for parameter in program.moved:
             parameter.grad = next(found)
         for key in program.written:
             batch.set(key, next(found))
-        return dict(zip(program.log, found, strict=True))
+        log = dict(zip(program.log, found, strict=False))
+        if program.stepped is None or not next(found).item():
+            return log, False
+        for group in program.stepped:
+            group.count_step(self._learner.optimizer.state)
+        return log, True
+
+    def forget(self) -> None:
+        """Have programs made again: the tensors of the learner lie elsewhere now."""
+        self._programs.clear()
 
     def _entries(self, batch: TensorDictBase) -> Entries:
         """Return the tensors that a program may read: all but those that the loss writes."""
@@ -110,39 +138,52 @@ class CompiledGradients:
         batch_size: torch.Size,
         trains: Trains,
         loss_function: str | None,
+        steps: bool,
     ) -> Program:
-        loss = self._loss
+        learner, loss = self._learner, self._loss
+        optimizer, stepped = learner.optimizer, None
         # Views of parameters that lie elsewhere now are taken again, and before a trace, which
         # cannot hold that modules are copied.
         loss.forget_networks()
         loss._networks()
+        learner.clear_gradients()
         state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
         parameters = [value for value in state.values() if value.requires_grad]
+        tensors = list(state.values())
+        if steps:
+            tensors += [each for group in optimizer.flat_groups for each in group.tensors()]
         moved: list[Tensor] = []
         written: Entries = {}
         log: dict[str, Tensor] = {}
 
-        def differentiate(*values: Tensor) -> list[Tensor]:
+        def update(*values: Tensor) -> list[Tensor]:
+            nonlocal stepped
             batch = TensorDict(dict(zip(entries, values, strict=True)), batch_size)
             with torch.enable_grad():
-                losses, more = loss.losses(
-                    batch, trains=trains, loss_function=loss_function, defer_gradient=False
-                )
-                roots = [value for value in losses.values() if value.requires_grad]
-                gradients = torch.autograd.grad(roots, parameters, allow_unused=True)
-            moved.extend(p for p, g in zip(parameters, gradients, strict=True) if g is not None)
+                log.update(learner._differentiate(batch, trains, loss_function))
             written.update((k, v) for k, v in batch.items(True, True) if k not in entries)
-            log.update({**losses, **more})
-            of_log = [value.detach() for value in log.values()]
-            return [*(each for each in gradients if each is not None), *written.values(), *of_log]
+            given = [*written.values(), *(value.detach() for value in log.values())]
+            if steps:
+                stepped = optimizer.due_groups()
+            if stepped is None:
+                moved.extend(each for each in parameters if each.grad is not None)
+                return [*(each.grad for each in moved), *given]  # type: ignore[list-item]
+            losses = [value for name, value in log.items() if name.startswith("loss")]
+            finite = torch.stack([each.detach().isfinite().all() for each in losses]).all()
+            with torch.no_grad():
+                for group in stepped:
+                    group.record_step(finite)
+                if trains != "critic":
+                    learner.targets.record_step(finite)
+            return [*given, finite]
 
         # Recorded with real numbers, as a loss may make tensors that it keeps; but with none of the
         # random numbers that the update will have.
         devices = {value.device for value in entries.values() if value.is_cuda}
-        buffers = [(value, value.clone()) for value in loss.buffers()]
+        before = [value.detach().clone() for value in tensors]
         try:
             with torch.random.fork_rng(devices):
-                graph_module = make_fx(differentiate)(*entries.values())
+                graph_module = make_fx(update)(*entries.values())
         except RuntimeError as error:
             if "data-dependent" not in str(error):
                 raise
@@ -151,12 +192,14 @@ class CompiledGradients:
                 f"got a {type(loss).__name__} where they do: {error}"
             ) from error
         finally:
-            # Layers with running statistics have counted the batch of the trace.
-            for value, before in buffers:
-                value.copy_(before)
-        taken = _take_state(graph_module, state)
+            # The steps were taken, and layers with running statistics have counted the batch.
+            with torch.no_grad():
+                for value, kept in zip(tensors, before, strict=True):
+                    value.copy_(kept)
+            learner.clear_gradients()
+        taken = _take_state(graph_module, tensors)
         call = self._compiled(graph_module.graph, [*entries.values(), *taken])
-        return Program(call, taken, moved, list(written), list(log))
+        return Program(call, taken, stepped, moved, list(written), list(log))
 
     def _compiled(self, graph: fx.Graph, inputs: list[Any]) -> Call:
         """Compile a graph, or return the program of an equal graph with equal inputs."""
@@ -176,18 +219,42 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
     """Compile a record by Inductor itself, unless ``torch.compile`` has another backend."""
     if arguments.keys() - {"options"}:
         return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
-    # ``torch.compile`` would record it once more, three seconds at the start, and would compare the
-    # inputs in each call, a third of an update. With gradients enabled there would be a second half
-    # of the program, for the gradients of the gradients.
-    with torch.no_grad():
-        return standalone_compile(
-            module,
-            inputs,
-            dynamic_shapes="from_example_inputs",
-            # The random numbers that the losses would have.
-            options={"config_patches": {"fallback_random": True, **arguments.get("options", {})}},
-            donate_graph_module=True,
-        )
+    # Inductor's compiler itself: the layers of ``torch.compile`` around it would record once more,
+    # three seconds at the start, and would take a tenth of an update.
+    mode = FakeTensorMode()
+    on_cpu = all(value.device.type == "cpu" for value in inputs)
+    # Random numbers are those that the losses would have.
+    patches = {"fallback_random": True, "cpp_wrapper": on_cpu, **arguments.get("options", {})}
+    context = torch._guards.TracingContext(mode)
+    with torch.no_grad(), config.patch(patches), torch._guards.tracing(context):
+        fakes = [mode.from_tensor(value.detach(), static_shapes=True) for value in inputs]
+        functional = torch.func.functionalize(lambda *values: module(*values))
+        with mode:
+            graph = make_fx(functional, decomposition_table=select_decomp_table())(*fakes)
+        _narrow_products(graph)
+        compiled: Any = compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
+    call = compiled.current_callable
+    return lambda *values: call([*values])
+
+
+def _narrow_products(module: fx.GraphModule) -> None:
+    """Compute of a matrix product only the columns that are used, as of the slope of Q."""
+    graph, aten = module.graph, torch.ops.aten
+    graph.eliminate_dead_code()
+    for node in graph.find_nodes(op="call_function", target=aten.slice.Tensor):
+        product, *columns = node.args
+        if product.target is not aten.mm.default or len(product.users) > 1 or columns[0] != 1:
+            continue
+        left, right = product.args
+        with graph.inserting_before(node):
+            part = graph.call_function(aten.slice.Tensor, (right, *columns))
+            narrow = graph.call_function(aten.mm.default, (left, part))
+        part.meta["val"] = aten.slice.Tensor(right.meta["val"], *columns)
+        narrow.meta["val"] = aten.mm.default(left.meta["val"], part.meta["val"])
+        node.replace_all_uses_with(narrow)
+        graph.erase_node(node)
+        graph.erase_node(product)
+    module.recompile()
 
 
 def _keep_programs() -> None:
@@ -219,10 +286,18 @@ def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
     return key, value.shape, value.dtype, value.device
 
 
-def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[Tensor]:
+def _records_steps(optimizer: Any) -> bool:
+    """Return True if the steps of an optimizer are in a program: Adam's, if nobody looks on."""
+    if not isinstance(optimizer, FlatAdam) or not optimizer.is_flat():
+        return False
+    return not (optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks)
+
+
+def _take_state(trace: fx.GraphModule, tensors: list[Tensor]) -> list[Tensor]:
     """Make the tensors that a trace holds its last inputs, and return them."""
     graph, inputs = trace.graph, dict[int, tuple[fx.Node, Tensor]]()
-    of_storage = {_place(value): value for value in state.values()}
+    # The last of those that lie in one place is what the others are views of.
+    of_storage = {_place(value): value for value in tensors}
     last = graph.find_nodes(op="placeholder")[-1]
     for node in graph.find_nodes(op="get_attr"):
         value = getattr(trace, node.target)
@@ -230,15 +305,23 @@ def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[Tensor]
         if place not in inputs:
             with graph.inserting_after(last):
                 last = graph.placeholder(f"state_{len(inputs)}")
-            # What is no tensor of the loss was made by it for the trace, or is kept by it.
+            # What is no tensor of the learner was made by its loss for the trace, or is kept by it.
             inputs[place] = last, of_storage.get(place, value)
-        view = value.shape, value.stride(), value.storage_offset()
-        with graph.inserting_before(node):
-            source = inputs[place][0], *view
-            taken = graph.call_function(torch.ops.aten.as_strided.default, source)
+        taken, whole = inputs[place]
+        if _view(value) != _view(whole):
+            with graph.inserting_before(node):
+                source = taken, *_view(value)
+                taken = graph.call_function(torch.ops.aten.as_strided.default, source)
         node.replace_all_uses_with(taken)
         graph.erase_node(node)
+    for node in graph.nodes:
+        # With what was noted of some inputs only, Inductor's C++ wrapper would miss the others.
+        node.meta.clear()
     return [value for _, value in inputs.values()]
+
+
+def _view(value: Tensor) -> tuple[torch.Size, tuple[int, ...], int]:
+    return value.shape, value.stride(), int(value.storage_offset())
 
 
 def _place(value: Tensor) -> int:

@@ -98,7 +98,7 @@ class DQNLearner(OptimizedLearner):
         """
         log = self._step(_whole_batch(sampled, self))
         self.updates += 1
-        return {key: value.detach() for key, value in log.items()}
+        return log
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
