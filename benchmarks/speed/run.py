@@ -17,6 +17,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from benchmarks.speed import (
@@ -28,6 +29,7 @@ from benchmarks.speed import (
     runs,
     start,
     training,
+    updates,
     vector,
     worlds,
 )
@@ -46,6 +48,11 @@ TARGETS: Mapping[str, float] = {
     "loss": 0.92,
     "train_step": 0.90,
     "sb3_step": 0.90,
+    "update_ddpg_64": 1.25,
+    "update_ddpg_256": 1.00,
+    "update_td3_64": 1.25,
+    "update_td3_256": 1.00,
+    "loop_ddpg_64": 1.00,
     "import_package": 1.10,
     "train_help": 1.30,
 }
@@ -74,6 +81,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "loss": loss.measure,
     "train_step": training.measure_train_step,
     "sb3_step": training.measure_sb3_step,
+    **{name: partial(updates.measure, name) for name in updates.CASES},
     "methods": method_steps.measure,
     "environment": measure_environment,
     "vector": vector.measure,

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -23,6 +22,7 @@ from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.modules import AdditiveGaussianModule
 
 from benchmarks.speed.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
+from benchmarks.speed.sbx_peer import IdleEnv
 from benchmarks.speed.timing import (
     MICROSECONDS,
     Call,
@@ -41,7 +41,9 @@ from torchrl_mpfa import (
     make_actor,
     make_critic,
     make_ddpg_loss,
+    make_td3_loss,
 )
+from torchrl_mpfa.losses import SignalLoss
 from training.run.compiling import has_compiler
 
 WIDTH = 256
@@ -60,12 +62,19 @@ class Agent:
 
     learner: Learner
 
-    def __init__(self, *, plain: bool, width: int = WIDTH, compile: bool = False) -> None:
+    def __init__(
+        self, *, plain: bool, width: int = WIDTH, compile: bool = False, algorithm: str = "ddpg"
+    ) -> None:
         torch.manual_seed(0)
         sizes = OBSERVATION_SIZE, ACTION_SIZE
         options: dict[str, Any] = {"width": width, **(_PLAIN if plain else {})}
         critic = make_critic(*sizes, **options, late_action=not plain)
-        loss = make_ddpg_loss(make_actor(*sizes, **options), critic)
+        actor = make_actor(*sizes, **options)
+        loss: SignalLoss
+        if algorithm == "td3":
+            loss = make_td3_loss(actor, critic, bounds=(-1.0, 1.0))
+        else:
+            loss = make_ddpg_loss(actor, critic)
         self.learner = ActorCriticLearner(loss, compile=compile)
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
         self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
@@ -152,25 +161,8 @@ def make_bare_step(*, gamma: float = 0.99, tau: float = 0.01) -> Call:
     return step
 
 
-class IdleEnv(gymnasium.Env[Any, Any]):
-    """An environment that does nothing, for Stable-Baselines3."""
-
-    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (OBSERVATION_SIZE,), np.float32)
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-    _observation = np.zeros(OBSERVATION_SIZE, dtype=np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Start an episode."""
-        super().reset(seed=seed)
-        return self._observation, {}
-
-    def step(self, action: Any) -> Any:
-        """Do nothing."""
-        return self._observation, 0.0, False, False, {}
-
-
 class IdleTorchEnv(EnvBase):
-    """The same for TorchRL."""
+    """An environment that does nothing, for TorchRL."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -197,9 +189,9 @@ class IdleTorchEnv(EnvBase):
         """Nothing is random."""
 
 
-def make_loop(*, compile: bool = False) -> Call:
+def make_loop(*, compile: bool = False, width: int = WIDTH) -> Call:
     """One round of a whole training loop of this package."""
-    agent, env = Agent(plain=True, compile=compile), IdleTorchEnv()
+    agent, env = Agent(plain=True, width=width, compile=compile), IdleTorchEnv()
     state = env.reset()
 
     def step() -> None:

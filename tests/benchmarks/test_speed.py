@@ -16,10 +16,12 @@ from benchmarks.speed import (
     method_steps,
     replay,
     run,
+    sbx_peer,
     scaling,
     start,
     timing,
     training,
+    updates,
     vector,
 )
 from benchmarks.speed.timing import Entry, Timing, entry
@@ -144,6 +146,31 @@ def test_a_training_step_is_compared_with_anothers(
     other, ours = measure(quick=True)
     check_schema([other, ours])
     assert (ours["name"], ours["baseline"], other["name"]) == (name, baseline, baseline)
+
+
+@pytest.mark.parametrize("name", ["update_td3_64", "loop_ddpg_64"])
+def test_updates_are_compared_with_those_of_a_process_of_sbx(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\nwhile read calls; do echo 4.5e6; done\n", encoding="utf-8")
+    python.chmod(0o700)
+    for module, constant, small in ((sbx_peer, "UPDATES", 2), (updates, "_STEPS", 3)):
+        monkeypatch.setattr(module, constant, small)
+    monkeypatch.setenv("SBX_PYTHON", str(python))
+    other, ours = updates.measure(name, quick=True)
+    check_schema([other, ours])
+    assert (ours["name"], ours["baseline"], other["name"]) == (name, f"{name}_sbx", f"{name}_sbx")
+    blocks = {"update_td3_64": 2, "loop_ddpg_64": 3}
+    assert other["value"] == pytest.approx(4.5e12 / blocks[name], rel=1e-6)
+    assert ours["value"] < 1e9
+
+
+def test_updates_are_not_compared_with_sbx_where_there_is_none(monkeypatch, capsys) -> None:
+    monkeypatch.delenv("SBX_PYTHON", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert updates.measure("update_ddpg_64", quick=True) == []
+    assert "update_ddpg_64: left out, no sbx-rl here" in capsys.readouterr().err
 
 
 def test_both_training_steps_learn() -> None:
