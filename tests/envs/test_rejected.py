@@ -244,9 +244,9 @@ def test_a_bad_argument_is_named_with_its_value(
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("num_env", "^unknown argument 'num_env': did you mean 'num_envs'"),
-        ("max_episode_steps", "^unknown argument .*: did you mean 'max_steps'"),
-        ("wrong", "^unknown argument 'wrong'$"),
+        ("num_env", "^got an unexpected keyword argument 'num_env': did you mean 'num_envs'"),
+        ("max_episode_steps", "^got an unexpected keyword argument .*: did you mean 'max_steps'"),
+        ("wrong", "^got an unexpected keyword argument 'wrong'$"),
     ],
 )
 def test_an_unknown_argument_is_rejected_with_the_nearest(make, name, message) -> None:

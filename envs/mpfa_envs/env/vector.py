@@ -448,4 +448,5 @@ def _check_names(task: Mapping[str, Any]) -> None:
     for name in task.keys() - fields_of_task:
         known = [*fields_of_task, *signature(VectorNavigationEnv).parameters]
         hint = f": {question}" if (question := did_you_mean(name, known)) else ""
-        raise TypeError(f"unknown argument {name!r}{hint}")
+        # In Python's words, by which TorchRL knows that an environment takes no `frameskip`.
+        raise TypeError(f"got an unexpected keyword argument {name!r}{hint}")
