@@ -27,6 +27,8 @@ from benchmarks import drivers, pictures, sampling
 from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.values import __main__ as values
+from torchrl_mpfa.methods import METHODS, Scaled
+from training.plugins import with_plugin
 from training.settings.command_line import parse_overrides
 from training.worlds import parse_worlds
 
@@ -100,7 +102,7 @@ def understand(words: Sequence[str]) -> None:
     """Let a script read its command line, and no more."""
     script, arguments = main_of(words)
     if script == "train":
-        parse_overrides(arguments)
+        parse_overrides(with_plugin(arguments)[0])
     if script in ("train", "torchrl_config"):
         return
     sys.argv = [script, *arguments]
@@ -126,6 +128,10 @@ def test_every_command_on_the_pages_is_understood(
     best.write_text("learner.tau: 0.01\n")
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
+    # A page names a plugin, which registers a method.
+    Path("mine.py").write_text("")
+    monkeypatch.setitem(METHODS, "mine", Scaled("mine", signals=["td_error"]))
+    monkeypatch.setitem(sys.modules, "mine", None)  # Leaves with the test.
     parse = argparse.ArgumentParser.parse_args
 
     def parsed(self: argparse.ArgumentParser, *arguments: Any) -> None:
