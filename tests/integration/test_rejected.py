@@ -185,7 +185,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (
             tune.main,
             "evaluation.every=0 evaluation.choose=false",
-            "evaluation.every must be from 1 to the 50000 actions",
+            "evaluation.every must be from 1 to the 30000 actions",
         ),
         (
             tune.main,
@@ -289,4 +289,5 @@ def test_without_its_extra_a_script_says_so_in_one_sentence(script: str, tmp_pat
         [sys.executable, "-c", hidden], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr == "this script needs hydra, pandas: pip install '.[examples]'\n"
+    needed = "install the extra 'examples', see Install in the README"
+    assert done.stderr == f"this script needs hydra, pandas: {needed}\n"

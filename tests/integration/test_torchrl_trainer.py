@@ -179,16 +179,10 @@ def test_the_example_trains_and_says_what_happened(capsys: pytest.CaptureFixture
 
 def test_the_code_of_the_page_runs() -> None:
     page = Path(__file__).parents[2] / "docs" / "torchrl_trainer.md"
-    in_trainer, in_loop = re.findall(
-        r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
-    )
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, Any] = {}
-    exec(in_trainer, names)
+    exec(code, names)
     assert names["trainer"].replay_buffer.sampler.weights
-    exec(in_loop, names)
-    assert len(names["buffer"]) == 320
-    assert names["learner"].updates == 80
-    assert names["buffer"].sampler.weights
 
 
 def test_a_collector_of_many_robots_acts_by_the_weights_that_were_learned() -> None:
