@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -18,6 +18,7 @@ from mpfa_envs.checks import (
     check_number,
     check_positive,
     check_share,
+    did_you_mean,
 )
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import PAPER_CLEARANCE, ROBOTS, TRAINING_CLEARANCE, RobotModel
@@ -328,3 +329,12 @@ class TaskConfig:
         lidar = self.make_lidar()
         described.update(rays=lidar.angles.size, sectors=lidar.sectors)
         return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}
+
+
+def check_names(task: Mapping[str, Any], others: Iterable[str]) -> None:
+    """Raise if an argument is neither a field of the task nor one of the others."""
+    own = {each.name for each in fields(TaskConfig)}
+    for name in task.keys() - own:
+        hint = f": {question}" if (question := did_you_mean(name, [*own, *others])) else ""
+        # In Python's words, by which TorchRL knows that an environment takes no `frameskip`.
+        raise TypeError(f"got an unexpected keyword argument {name!r}{hint}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,8 +13,8 @@ from gymnasium.spaces import Box as BoxSpace
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mpfa_envs.checks import check_count, did_you_mean
-from mpfa_envs.env.config import TaskConfig
+from mpfa_envs.checks import check_count
+from mpfa_envs.env.config import TaskConfig, check_names
 from mpfa_envs.env.episodes import EpisodeSource, WorldChoice
 from mpfa_envs.env.reset_options import (
     read_mask,
@@ -107,7 +106,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         **task: Any,
     ) -> None:
         self.num_envs = check_count("num_envs", num_envs)
-        _check_names(task)
+        check_names(task, signature(VectorNavigationEnv).parameters)
         self.config = TaskConfig(**task)
         """The settings of the task."""
         self.metadata = read_view(self.metadata, render_mode, self.config.action_time)
@@ -440,13 +439,3 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         # gymnasium 1.2 also closes an environment whose arguments were rejected.
         if hasattr(self, "_batch"):
             self._batch.drives.close()
-
-
-def _check_names(task: Mapping[str, Any]) -> None:
-    """Raise if an argument is neither one of the vector nor a field of the task."""
-    fields_of_task = {each.name for each in fields(TaskConfig)}
-    for name in task.keys() - fields_of_task:
-        known = [*fields_of_task, *signature(VectorNavigationEnv).parameters]
-        hint = f": {question}" if (question := did_you_mean(name, known)) else ""
-        # In Python's words, by which TorchRL knows that an environment takes no `frameskip`.
-        raise TypeError(f"got an unexpected keyword argument {name!r}{hint}")
