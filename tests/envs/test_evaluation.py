@@ -233,6 +233,11 @@ def test_generators_have_150_seconds_and_barn_100() -> None:
     assert found[0].timeout and found[0].time_s == pytest.approx(150.0)
 
 
+def test_a_slower_robot_has_longer_in_proportion_to_its_speed() -> None:
+    for robot, steps in {"kobuki": 1500, "turtlebot4": 2451, "burger": 3409}.items():
+        assert world_tasks("bars:test", episodes=1, robot=robot)[0].max_steps == steps
+
+
 def test_a_time_limit_is_in_seconds_whatever_the_time_step() -> None:
     for time_step in (0.05, 0.2):
         given = {"physics": "kinematic", "time_step": time_step, "action_repeat": 1}

@@ -97,8 +97,7 @@ def _near_points(
     if body.limits.slow > 0.0:
         reach += 2.0 * _turning_radius(body.limits, body.wheel_base)
     else:
-        # Speeds fall in steps: the first one is still at full speed.
-        reach += 0.5 * fastest * fastest / body.limits.acceleration + fastest * body.time_step
+        reach += 0.5 * fastest * fastest / body.limits.acceleration
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
