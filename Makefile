@@ -1,7 +1,7 @@
 # All commands of the project. `make` alone lists them.
 #
-# The first use creates .venv and installs the project in it; later uses do so only if
-# pyproject.toml has changed. Variables on the command line:
+# The first use creates .venv and installs what the scripts need, and for tests and checks the
+# rest; later uses do so only if pyproject.toml has changed. Variables on the command line:
 #   PYTHON=/path/to/python3.11     the Python for .venv; by default the first suitable one
 #   TORCH_INSTALL_ARGS='...'       arguments of `pip install` for another build of PyTorch, which
 #                                  is installed before the project: the wheel file of a CPU
@@ -30,7 +30,9 @@ WORKERS ?= 2
 
 VENV := .venv
 BIN := $(VENV)/bin
+# What the scripts need, and with it what tests and checks need.
 STAMP := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
 TORCH := $(VENV)/.torch-args
 PYTEST := $(BIN)/python -m pytest
 DOCTESTS := --doctest-modules torchrl_mpfa envs
@@ -70,33 +72,33 @@ train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: t
 paper: $(STAMP) ## Write docs/paper.md and its figures from the kept rows of the paper's runs
 	$(BIN)/python -m benchmarks.paper $(ARGS)
 
-test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
+test: $(DEV) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ALSO) $(ARGS)
 
 check: lint types test ## Check format, lint, types, doctests and tests
 
-lint: $(STAMP)
+lint: $(DEV)
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m ruff check .
 
-types: $(STAMP)
+types: $(DEV)
 	$(BIN)/python -m mypy
 
-doctest: $(STAMP)
+doctest: $(DEV)
 	$(PYTEST) $(DOCTESTS)
 
-format: $(STAMP) ## Format the code and fix what ruff can fix
+format: $(DEV) ## Format the code and fix what ruff can fix
 	$(BIN)/python -m ruff format .
 	$(BIN)/python -m ruff check --fix .
 
-docs: $(STAMP) ## Build the documentation site; open site/index.html
+docs: $(DEV) ## Build the documentation site; open site/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	@echo "written: site/index.html"
 
-bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
+bench: $(DEV) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
 	$(BIN)/python -m benchmarks.speed $(ARGS)
 
-wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and test it
+wheel-test: $(DEV) ## Build sdist and wheel, install the wheel elsewhere and test it
 	$(BIN)/python .ci/wheel_test.py
 
 clean: ## Remove builds and caches; runs/ and .venv stay
@@ -146,11 +148,16 @@ $(STAMP): pyproject.toml
 	  echo "== making $(VENV) with $$python"; \
 	  "$$python" -m venv --clear $(VENV) || exit 1; \
 	fi
-	@echo "== installing in $(VENV); the first time this downloads PyTorch, some gigabytes"
+	@echo "== installing in $(VENV), silently; the first time this downloads PyTorch, some gigabytes"
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip uninstall -qq -y torch)
-	$(if $(strip $(TORCH_INSTALL_ARGS)),$(BIN)/python -m pip install $(TORCH_INSTALL_ARGS))
+	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip install -q $(TORCH_INSTALL_ARGS))
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@printf '%s\n' '$(subst ','\'',$(TORCH_INSTALL_ARGS))' > $(TORCH))
 	@# Pip before 23.1, which comes with Python 3.10, does not find versions that fit each other.
 	@$(BIN)/python -m pip install -q 'pip>=23.1'
-	$(BIN)/python -m pip install -e ".[dev]"
+	@$(BIN)/python -m pip install -q -e ".[examples]"
 	@touch $(STAMP)
+
+$(DEV): $(STAMP)
+	@echo "== installing what tests and checks need in $(VENV), silently"
+	@$(BIN)/python -m pip install -q -e ".[dev]"
+	@touch $(DEV)

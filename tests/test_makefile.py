@@ -43,7 +43,8 @@ def copy(tmp_path: Path) -> Path:
 @pytest.fixture
 def installed(copy: Path) -> Path:
     add_program(copy / ".venv" / "bin" / "python", PRETENDER)
-    (copy / ".venv" / ".installed").touch()
+    for stamp in STAMPS:
+        (copy / ".venv" / stamp).touch()
     return copy
 
 
@@ -65,6 +66,8 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 NEW_PIP = "-m pip install -q pip>=23.1"
+STAMPS = (".installed", ".installed-dev")
+SCRIPTS, REST = (f"-m pip install -q -e .[{extra}]" for extra in ("examples", "dev"))
 
 
 def pip_calls(folder: Path) -> list[str]:
@@ -179,17 +182,31 @@ def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: 
     add_program(copy / "bin" / "python3.11", PRETENDER)
     assert make(copy, "-q", ".venv/.installed").returncode == 1
     assert make(copy, "test").returncode == 0
-    assert (copy / "pip.log").read_text().splitlines() == [NEW_PIP, "-m pip install -e .[dev]"]
+    assert (copy / "pip.log").read_text().splitlines() == [NEW_PIP, SCRIPTS, REST]
     assert make(copy, "test").returncode == 0
-    assert make(copy, "-q", ".venv/.installed").returncode == 0
-    assert len(pip_calls(copy)) == 1
+    for stamp in STAMPS:
+        assert make(copy, "-q", f".venv/{stamp}").returncode == 0
+    assert len(pip_calls(copy)) == 2
 
-    stamp = (copy / ".venv" / ".installed").stat().st_mtime
-    os.utime(copy / "pyproject.toml", (stamp + 10, stamp + 10))
+    changed = (copy / ".venv" / ".installed-dev").stat().st_mtime + 10
+    os.utime(copy / "pyproject.toml", (changed, changed))
     done = make(copy, "test")
     assert done.returncode == 0
-    assert len(pip_calls(copy)) == 2
+    assert len(pip_calls(copy)) == 4
     assert "making .venv" not in done.stdout  # The environment itself is kept.
+
+
+@pytest.mark.parametrize("goal", ["demo", "train", "paper"])
+def test_what_only_tests_need_is_installed_for_them_alone(copy: Path, goal: str) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    done = make(copy, ".venv/.installed")  # The goals' own commands have nothing to run here.
+    assert [line for line in done.stdout.splitlines() if "installing" in line] == [
+        "== installing in .venv, silently; the first time this downloads PyTorch, some gigabytes"
+    ]
+    assert pip_calls(copy) == [SCRIPTS]
+    assert "pip install" not in make(copy, "-n", goal).stdout
+    assert make(copy, "test").returncode == 0
+    assert pip_calls(copy) == [SCRIPTS, REST]
 
 
 def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: Path) -> None:
@@ -197,10 +214,10 @@ def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: P
     other = LATER.replace("/somewhere 3.11", "/somewhere 3.12")
     add_program(copy / "bin" / "python3.12", other)
     for program, calls, again in (
-        ("python3.12", 1, True),
-        ("python3.12", 1, False),
-        ("python3.11", 2, True),
-        ("python3.11", 2, False),
+        ("python3.12", 2, True),
+        ("python3.12", 2, False),
+        ("python3.11", 4, True),
+        ("python3.11", 4, False),
     ):
         done = make(copy, f"PYTHON={program}", "test")
         assert done.returncode == 0, done.stderr
@@ -218,27 +235,27 @@ def test_an_install_that_failed_is_made_again(copy: Path) -> None:
     assert not (copy / ".venv" / ".installed").exists()
     (copy / "no_network").unlink()
     assert make(copy, "test").returncode == 0
-    assert pip_calls(copy) == ["-m pip install -e .[dev]"]
+    assert pip_calls(copy) == [SCRIPTS, REST]
 
 
 def test_another_build_of_torch_is_installed_before_the_project(copy: Path) -> None:
     add_program(copy / "bin" / "python3.11", PRETENDER)
     assert make(copy, "test", "TORCH_INSTALL_ARGS=./torch-cpu.whl").returncode == 0
-    assert pip_calls(copy) == ["-m pip install ./torch-cpu.whl", "-m pip install -e .[dev]"]
+    assert pip_calls(copy) == ["-m pip install -q ./torch-cpu.whl", SCRIPTS, REST]
 
 
 def test_other_arguments_for_torch_install_again_and_the_same_or_none_do_not(copy: Path) -> None:
     add_program(copy / "bin" / "python3.11", PRETENDER)
     other = "torch==2.15.* --index-url 'file:///a b'"
     for words, calls in (
-        ([], 1),
-        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 3),
-        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 3),
-        ([], 3),
-        ([f"TORCH_INSTALL_ARGS={other}"], 5),
-        ([f"TORCH_INSTALL_ARGS={other}"], 5),
+        ([], 2),
+        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 5),
+        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 5),
+        ([], 5),
+        ([f"TORCH_INSTALL_ARGS={other}"], 8),
+        ([f"TORCH_INSTALL_ARGS={other}"], 8),
     ):
         done = make(copy, "test", *words)
         assert done.returncode == 0, done.stderr
         assert len(pip_calls(copy)) == calls
-    assert pip_calls(copy)[3] == "-m pip install torch==2.15.* --index-url file:///a b"
+    assert pip_calls(copy)[5] == "-m pip install -q torch==2.15.* --index-url file:///a b"
