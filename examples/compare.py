@@ -3,7 +3,7 @@
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, 18 runs
     python examples/compare.py --worlds test mazes:test --episodes 40    a world and a generator's
-    python examples/compare.py --physics wheels --filter  evaluated on wheels, behind the filter
+    python examples/compare.py --physics wheels --no-filter    evaluated on wheels, no filter
     python examples/compare.py --arm default: --arm phi2:method.boost_factor=2    two arms of each
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
     python examples/compare.py --plugin mine.py --methods mine per    a method of your own
@@ -67,7 +67,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--episodes", type=int, default=TESTED.episodes, help="for each (default: 200)"
     )
     parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
-    parser.add_argument("--filter", action="store_true", help="evaluate behind the filter")
+    parser.add_argument(
+        "--filter",
+        action=argparse.BooleanOptionalAction,
+        help="evaluate behind the filter (default: policies that had it in all of their training)",
+    )
     parser.add_argument(
         "--arm",
         action="append",

@@ -24,6 +24,7 @@ import numpy as np
 from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy
 from mpfa_envs.policies.files import policy_file
 from training import files
+from training.evaluating import as_trained, needs_filter
 
 TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""
@@ -79,8 +80,8 @@ def known_results(source: Path) -> list[dict[str, Any]]:
             asked = json.loads(settings.read_text(encoding="utf-8"))
             if asked.get("sha256") == files.digest(source):
                 numbers = json.loads(file.read_text(encoding="utf-8"))
-                worlds = {"worlds_asked": asked["words"], "physics": asked["physics"]}
-                found.append({**worlds, **numbers})
+                how = {"physics": asked["physics"], "filter": "filter" in asked}
+                found.append({"worlds_asked": asked["words"], **how, **numbers})
     return found
 
 
@@ -92,8 +93,10 @@ def largest_difference(one: Policy, other: Policy) -> float:
 
 
 def driven(policy: Policy, options: argparse.Namespace) -> dict[str, Any]:
-    """Drive a policy through the tasks, on exact arcs."""
-    results = evaluate(policy, options.world, episodes=options.episodes, physics="kinematic")
+    """Drive a policy through the tasks, on exact arcs, behind the filter if it needs that."""
+    results = evaluate(
+        as_trained(policy), options.world, episodes=options.episodes, physics="kinematic"
+    )
     rates = {
         name: sum(getattr(each, name) for each in results) / len(results)
         for name in ("success", "collision", "timeout")
@@ -143,6 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
                 "world": options.world,
                 "episodes": options.episodes,
                 "physics": "kinematic",
+                "filter": needs_filter(policy),
                 "same": sum(same),
             }
         )

@@ -76,6 +76,11 @@ def needs_filter(policy: Drivable) -> bool:
     return bool(getattr(policy, "card", {}).get("filter", False))
 
 
+def as_trained(policy: Policy) -> Policy | Filtered:
+    """Put a policy behind the filter if it needs that."""
+    return filtered(policy) if needs_filter(policy) else policy
+
+
 def tasks_of(
     policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
 ) -> list[WorldTask]:
@@ -112,12 +117,12 @@ def drive(
     apart = arguments.get("physics") != "kinematic" and max(map(len, sets)) > SERVERS
     driven: list[Drives] = []
     for group in [[each] for each in sets] if apart else [sets]:
-        driven += _drive_together(policy, group, progress, arguments)
+        driven += drive_together(policy, group, progress=progress, **arguments)
     return driven
 
 
-def _drive_together(
-    policy: Drivable, sets: Sequence[list[WorldTask]], progress: bool, arguments: dict[str, Any]
+def drive_together(
+    policy: Drivable, sets: Sequence[list[WorldTask]], *, progress: bool, **arguments: Any
 ) -> list[Drives]:
     """Drive sets of tasks by as many robots as the largest of them has."""
     tasks = [task for each in sets for task in each]

@@ -40,6 +40,15 @@ def test_the_script_tells_what_it_compared_and_puts_known_results_on_the_card(
     assert sorted(path.suffix for path in tmp_path.glob("policy.*")) == [".json", ".npz", ".onnx"]
 
 
+def test_a_policy_that_needs_the_filter_is_driven_behind_it(tmp_path: Path) -> None:
+    file = tmp_path / "policy.onnx"
+    tasks = ["--world", "mazes:validation", "--episodes", "10"]
+    export.main(["td3-rooms", *tasks, "--output", str(file)])
+    compared = json.loads(file.with_suffix(".json").read_text())["results"][-1]
+    assert compared["filter"] and compared["same"] == 10
+    assert compared["exported"]["success"] == 1.0
+
+
 def test_a_file_that_differs_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

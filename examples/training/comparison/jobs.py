@@ -10,10 +10,11 @@ from typing import Any
 
 import pandas as pd
 
+from mpfa_envs import load_policy
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.arms import PLAIN, Arm, with_defaults
-from training.evaluating import evaluation_folder
+from training.evaluating import evaluation_folder, needs_filter
 from training.finished import is_finished, read_json
 from training.plugins import plugin_words
 from training.records import read_table, write_table
@@ -45,8 +46,8 @@ class Evaluation:
     """Pairs of start and goal in each of them."""
     physics: str | None = None
     """``wheels`` or ``kinematic``; None: as trained."""
-    filtered: bool = False
-    """True if actions pass the filter."""
+    filtered: bool | None = None
+    """True if actions pass the filter; None: those of policies that need it."""
     plugin: str | None = None
     """Path of the plugin."""
 
@@ -105,7 +106,11 @@ class Job:
             *(str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
             *(["--physics", wanted.physics] if wanted.physics else []),
-            *(["--filter"] if wanted.filtered else []),
+            *(
+                []
+                if wanted.filtered is None
+                else ["--filter" if wanted.filtered else "--no-filter"]
+            ),
             *(["--plugin", wanted.plugin] if wanted.plugin else []),
         ]
 
@@ -116,10 +121,16 @@ class Job:
         trained = read_json(self.path / files.SETTINGS).get("environment", {})
         return str(trained.get("physics", EnvironmentSettings.physics))
 
+    def filtered(self, wanted: Evaluation) -> bool:
+        """Return True if its evaluation has the filter: if asked for, or if its policy needs it."""
+        if wanted.filtered is not None:
+            return wanted.filtered
+        return (self.path / files.POLICY).exists() and needs_filter(load_policy(self.path))
+
     def results(self, wanted: Evaluation) -> Path:
         """Return the folder of its evaluation."""
         return self.path / evaluation_folder(
-            wanted.words, self.physics(wanted), filtered=wanted.filtered
+            wanted.words, self.physics(wanted), filtered=self.filtered(wanted)
         )
 
     def status(self) -> Mapping[str, Any]:
@@ -139,7 +150,7 @@ class Job:
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
             and found.get("physics") == self.physics(wanted)
-            and ("filter" in found) == wanted.filtered
+            and ("filter" in found) == self.filtered(wanted)
             # A comparison drives the pairs of the first seed, and robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None

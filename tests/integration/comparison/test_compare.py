@@ -9,17 +9,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import compare
 import evaluate
+from mpfa_envs import Policy, load_policy, save_policy
 from tests.integration.tiny_runs import OVERRIDES
 from training import figures, files
 from training.comparison import execution
 from training.comparison.arms import parse_arm, with_defaults
-from training.comparison.jobs import Job, other_than_asked
+from training.comparison.jobs import Evaluation, Job, other_than_asked
 from training.comparison.workers import Lost
 from training.records import read_table
 from training.run import script
@@ -141,6 +143,25 @@ def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     script.write_settings(job.asked(many), job.path / files.SETTINGS)
     assert not other_than_asked([job], many)
     assert (job in other_than_asked([job], [*many, setting])) == matters
+
+
+@pytest.mark.parametrize(("needs", "asked"), [(True, None), (False, None), (True, False)])
+def test_policies_are_evaluated_behind_the_filter_that_they_need_unless_asked_otherwise(
+    needs: bool, asked: bool | None, tmp_path: Path
+) -> None:
+    job = Job("td3", "per", 0, tmp_path)
+    job.path.mkdir()
+    policy = load_policy("td3-rooms")
+    how = {"card": {"filter": needs}, "env_arguments": policy.env_arguments}
+    save_policy(Policy(policy.layers, **how), job.path / files.POLICY)
+    (job.path / files.EPISODES).write_text("success,world\n")
+    (job.path / files.STATUS).write_text('{"finished": true}')
+    wanted = Evaluation(("A",), 1, "kinematic", asked)
+    assert not job.is_evaluated(wanted)
+    evaluate.main(job.evaluates(wanted)[1:])
+    assert job.is_evaluated(wanted)
+    assert job.results(wanted).name.endswith("-filter") == (needs and asked is None)
+    assert not job.is_evaluated(replace(wanted, filtered=not needs if asked is None else True))
 
 
 @pytest.mark.slow
