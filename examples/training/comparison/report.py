@@ -50,13 +50,20 @@ def write_report(folders: Sequence[Path], output: Path) -> str:
     files.check_folder(output)
     rows = read_comparisons(folders)
     evaluations = tables_of_runs(rows, files.EVALUATIONS)
-    parts = [HOW_TO_READ, *sections(rows)]
-    output.mkdir(parents=True, exist_ok=True)
+    parts = sections(rows)
     if evaluations:
         picture = "![Greedy success in the validation world over actions](evaluations.png)"
         parts += ["## Evaluations during training", rate_table(evaluations), picture]
+    text = write_tables(parts, output)
+    if evaluations:
         plot_evaluations(evaluations, output / "evaluations.png")
-    text = "\n\n".join(part for part in parts if part)
+    return text
+
+
+def write_tables(parts: Sequence[str], output: Path) -> str:
+    """Write how to read them, and the parts, in ``tables.md``; return the text."""
+    output.mkdir(parents=True, exist_ok=True)
+    text = "\n\n".join(part for part in (HOW_TO_READ, *parts) if part)
     write_text_atomically(text + "\n", output / "tables.md")
     return text
 

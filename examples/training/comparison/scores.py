@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 
 from mpfa_envs.render.charts import Curve
-from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.report import HOW_TO_READ, difference_table, interval, number, table
+from training.comparison.report import difference_table, interval, number, table, write_tables
 from training.figures import plot_scores
 from training.records import read_table
 from training.statistics import mean_interval
@@ -42,13 +41,9 @@ def write_scores(paths: Sequence[Path], output: Path) -> str:
     """
     files.check_folder(output)
     tasks = {str(task): runs_of(found) for task, found in read_scores(paths).groupby("task")}
-    parts = [HOW_TO_READ]
-    for task, runs in tasks.items():
-        parts += [f"## {task}", *score_tables(runs)]
-    parts.append(f"![Scores over steps: mean of the runs]({CURVES})")
+    parts = [part for task, runs in tasks.items() for part in (f"## {task}", *score_tables(runs))]
+    text = write_tables([*parts, f"![Scores over steps: mean of the runs]({CURVES})"], output)
     plot_scores(tasks, output / CURVES)
-    text = "\n\n".join(part for part in parts if part)
-    write_text_atomically(text + "\n", output / "tables.md")
     return text
 
 
