@@ -246,6 +246,7 @@ def test_a_bad_argument_is_named_with_its_value(
     [
         ("num_env", "^got an unexpected keyword argument 'num_env': did you mean 'num_envs'"),
         ("max_episode_steps", "^got an unexpected keyword argument .*: did you mean 'max_steps'"),
+        ("collision_distance", "^got an unexpected .*: give clearance, .*, or contact=True$"),
         ("wrong", "^got an unexpected keyword argument 'wrong'$"),
     ],
 )
