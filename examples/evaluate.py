@@ -61,9 +61,10 @@ from training.evaluating import (
     tasks_of,
 )
 from training.live import watch
-from training.pictures import Values, write_pictures
+from training.pictures import TRAJECTORIES, Values, write_pictures
 from training.plugins import add_plugin
 from training.records import as_table, write_table
+from training.run.tracking import log_evaluation
 from training.run.values import load_learner, values_of
 from training.worlds import parse_worlds, world_name
 
@@ -294,6 +295,18 @@ def held(folder: Path) -> Iterator[None]:
         raise SystemExit(2) from None
 
 
+def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> Iterator[str]:
+    """Log the evaluation to the wandb run of the training; yield lines that say so."""
+    name, steps = folder.name.removeprefix("evaluation-"), policy.card.get("steps", 0)
+    try:
+        found = log_evaluation(run, name, summary, actions=steps, picture=folder / TRAJECTORIES)
+    except ValueError as error:
+        yield f"not in wandb: {error}"
+    else:
+        if found:
+            yield f"in wandb, too: {found}"
+
+
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     """Evaluate, print, write.
 
@@ -347,6 +360,9 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")
+    if isinstance(policy, Policy) and options.path.is_dir():
+        for line in logged(policy, options.path, folder, summary):
+            print(line)
     return summary
 
 

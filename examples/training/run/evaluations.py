@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from tensordict.nn import TensorDictModule
 
-from mpfa_envs import Policy, RobotModel, WorldTask, run_tasks, world_tasks
+from mpfa_envs import Policy, RobotModel, WorldTask, world_tasks
 from mpfa_envs.robots.resolve import resolve_robot
 from training.environments import env_arguments
-from training.evaluating import Drivable, filtered
+from training.evaluating import Drives, as_trained, drive_together
 from training.records import EvaluationRecord, last_best
 from training.run.assembly import policy_layers
 from training.settings.learners import is_discrete
@@ -64,7 +64,7 @@ def evaluate_policy(
     total_steps: int,
     episode: int,
     trained_for: float,
-) -> EvaluationRecord:
+) -> tuple[EvaluationRecord, Drives]:
     """Drive the fixed tasks of the validation world, or of others that the settings name.
 
     Args:
@@ -75,22 +75,22 @@ def evaluate_policy(
         trained_for: Wall-clock time of the training so far [s].
 
     Returns:
-        Rates of success, collision and timeout, and the means of SPL and SCT.
+        Rates of success, collision and timeout, the means of SPL and SCT, and the episodes.
     """
     start = time.perf_counter()
-    wanted, exported = settings.evaluation, exported_policy(policy, settings)
-    driver: Drivable = filtered(exported) if _always_filtered(settings) else exported
+    wanted, driver = settings.evaluation, as_trained(exported_policy(policy, settings))
     tasks = _tasks(wanted.world, wanted.episodes, resolve_robot(settings.environment.robot))
-    results = run_tasks(driver, tasks, **driver.env_arguments)
+    [driven] = drive_together(driver, [tasks], progress=False, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl", "sct")
-    return EvaluationRecord(
+    record = EvaluationRecord(
         total_steps=total_steps,
         episode=episode,
         world=wanted.world,
         seconds=time.perf_counter() - start,
         trained_for=trained_for,
-        **{name: sum(getattr(r, name) for r in results) / len(results) for name in names},
+        **{name: sum(getattr(r, name) for r in driven.results) / len(tasks) for name in names},
     )
+    return record, driven
 
 
 @lru_cache(maxsize=4)

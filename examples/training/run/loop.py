@@ -21,6 +21,7 @@ from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
+from training.evaluating import Drives
 from training.plugins import OwnSignals
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import showing
@@ -91,6 +92,8 @@ class TrainingRun:
         """Events of the iteration that hooks still have to get."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
+        self.driven: Drives | None = None
+        """Episodes of the last evaluation."""
         self._bonus: dict[str, Tensor] = {}
         self.best: TensorDictModule | None = None
         """The policy that did best in the evaluations."""
@@ -260,7 +263,7 @@ class TrainingRun:
         return sampled
 
     def _evaluate(self) -> None:
-        found = evaluate_policy(
+        found, self.driven = evaluate_policy(
             self.settings,
             self.learner.policy,
             total_steps=self.actions,

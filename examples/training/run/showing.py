@@ -13,7 +13,7 @@ from PIL import Image
 from mpfa_envs import save_policy
 from mpfa_envs.evaluation.results import EpisodeResult
 from training import files
-from training.evaluating import drive
+from training.evaluating import as_trained, drive
 from training.pictures import EPISODE, TRAJECTORIES, VALUES, write_pictures
 from training.records import as_table
 from training.run.evaluations import SEED, kept_policy
@@ -42,19 +42,20 @@ def show_policy(run: TrainingRun) -> None:
     The worlds are those of the run's evaluations. Nothing is done unless pictures are asked for
     and a log can show them. The clock of the run, which shows how long it trains, stands still.
     """
-    settings = run.settings
-    if settings.tracking.pictures_every is None or not run.tracker.shows:
+    if not run.tracker.shows:
         return
+    settings = run.settings
     begun, wanted, policy = time.perf_counter(), settings.evaluation, kept_policy(run)
     file = run.folder / files.POLICY
     save_policy(policy, file, overwrite=True)
+    driver = as_trained(policy)
     [drives] = drive(
-        policy, [wanted.world], episodes=wanted.episodes, seed=SEED, physics=None, progress=False
+        driver, [wanted.world], episodes=wanted.episodes, seed=SEED, physics=None, progress=False
     )
     values = values_of(run.learner, policy, settings)
     with TemporaryDirectory() as place:
         made = Path(place)
-        write_pictures(policy, [drives], made, values=values)
+        write_pictures(driver, [drives], made, values=values)
         entries: dict[str, Any] = {
             "policy/paths": np.asarray(Image.open(made / TRAJECTORIES)),
             "policy/values": np.asarray(Image.open(made / VALUES)),

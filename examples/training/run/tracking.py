@@ -9,18 +9,30 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import pandas as pd
 import torch
+from PIL import Image
 from tensordict import TensorDictBase
 
+from training import files
+from training.pictures import trajectories_of
 from training.records import EpisodeRecord, EvaluationRecord
+from training.run.checkpoints import read_checkpoint
 from training.run.hooks import Hook
 from training.run.loggers import CSVLog, Log, TensorboardLog
 from training.settings.rules import settings_by_name
-from training.settings.train import TrackingSettings, TrainSettings
+from training.settings.train import TrackingSettings, TrainSettings, as_settings
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
     from training.run.wandb_log import WandbLog
+
+
+_RATES = ("success", "collision", "timeout", "spl", "sct")
+"""Numbers of an evaluation."""
+_SMALL = 240
+"""Width of a world in pictures during the training [px]; they take 0.1 s each."""
 
 
 class Tracker(Hook):
@@ -39,6 +51,7 @@ class Tracker(Hook):
         # A sweep has given its run an id.
         self.run_id = run_id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
         wanted = settings.tracking
+        self._pictures = wanted.pictures_every is not None
         self._logs: list[Log] = []
         self.upload = upload_command(wanted, folder, self.run_id)
         """Command that uploads the run to wandb, if it is kept offline."""
@@ -68,9 +81,10 @@ class Tracker(Hook):
         self._log(entries, record.total_steps)
 
     def on_evaluation(self, run: TrainingRun, record: EvaluationRecord) -> None:
-        """Log an evaluation."""
-        rates = ("success", "collision", "timeout", "spl", "sct")
-        entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
+        """Log an evaluation, with a picture of its paths where a log can show it."""
+        entries: dict[str, Any] = {f"evaluation/{name}": getattr(record, name) for name in _RATES}
+        if self.shows and run.driven is not None:
+            entries["evaluation/paths"] = trajectories_of([run.driven], size=_SMALL)
         self._log(entries, record.total_steps)
 
     def on_update(
@@ -94,8 +108,8 @@ class Tracker(Hook):
 
     @property
     def shows(self) -> bool:
-        """True if there is a log for pictures."""
-        return any(not isinstance(log, CSVLog) for log in self._logs)
+        """True if pictures are asked for, and there is a log for them."""
+        return self._pictures and any(not isinstance(log, CSVLog) for log in self._logs)
 
     def log_policy(
         self, entries: Mapping[str, Any], *, file: Path, card: Mapping[str, Any], actions: int
@@ -118,6 +132,37 @@ class Tracker(Hook):
         """Finish the logs."""
         for log in self._logs:
             log.close()
+
+
+def log_evaluation(
+    run: Path, name: str, table: pd.DataFrame, *, actions: int, picture: Path
+) -> str | None:
+    """Log an evaluation of a run's policy to the wandb run of its training, if there is one.
+
+    Args:
+        run: Folder of the run.
+        name: Of the evaluation.
+        table: A row for each world, and last the total.
+        actions: Those after which the policy was kept.
+        picture: The paths; nothing if there is no such file.
+
+    Returns:
+        The command that uploads the run, if it is kept offline.
+    """
+    if not ((run / "wandb").is_dir() and (run / files.CHECKPOINT).exists()):
+        return None
+    from training.run.wandb_log import WandbLog
+
+    state = read_checkpoint(run)
+    settings, total = as_settings(state["settings"]), table.iloc[-1]
+    entries: dict[str, Any] = {f"evaluate/{name}/{rate}": float(total[rate]) for rate in _RATES}
+    entries[f"evaluate/{name}/worlds"] = table
+    if picture.exists():
+        entries[f"evaluate/{name}/paths"] = np.asarray(Image.open(picture))
+    log = WandbLog(settings, run, run_id=state["wandb"])
+    log.log(entries, actions)
+    log.close()
+    return upload_command(settings.tracking, run, state["wandb"])
 
 
 def upload_command(wanted: TrackingSettings, folder: Path, run_id: str) -> str | None:

@@ -19,6 +19,9 @@ AXIS = "actions"
 """Axis of every entry: actions of all robots so far."""
 
 
+_LATE = ("policy/", "evaluate/")
+"""Entries that may come after others of the same action: pictures that had been interrupted, and
+what ``evaluate.py`` adds."""
 BEST = ("evaluation/success", "evaluation/spl")
 """Entries of which the summary keeps the best."""
 
@@ -70,8 +73,7 @@ class WandbLog:
 
     def log(self, entries: Mapping[str, Any], actions: int) -> None:
         """Log entries, unless they were logged before the run was stopped."""
-        # Pictures may have been interrupted after the numbers of the same action.
-        if actions <= self._before and not any(name.startswith("policy/") for name in entries):
+        if actions <= self._before and not any(name.startswith(_LATE) for name in entries):
             return
         shown = {name: _as_wandb(value) for name, value in entries.items()}
         self._run.log({**shown, AXIS: actions}, step=self._entries, commit=True)

@@ -184,8 +184,8 @@ class TrackingSettings:
     log_every: int = setting(200, at_least(1))
     """Actions between two entries of losses, weights and priorities."""
     pictures_every: int | None = setting(0, at_least(0))
-    """Actions between two sets of pictures of the policy, for wandb and TensorBoard; 0: at the end
-    alone, null: none."""
+    """Actions between two sets of pictures of the policy, for wandb and TensorBoard; 0: one set at
+    the end, and the paths of each evaluation; null: none."""
 
 
 @dataclass

@@ -22,6 +22,7 @@ from tests.integration.tiny_runs import (
 )
 from torchrl_mpfa import Stop
 from training import files
+from training.evaluating import Drives
 from training.records import EvaluationRecord, read_table
 from training.run import loop
 from training.run.checkpoints import read_checkpoint
@@ -180,8 +181,9 @@ def test_the_script_on_the_page_stops_after_two_good_evaluations_in_a_row(
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
     evaluate, found = loop.evaluate_policy, iter((0.95, 0.9, 1.0, 0.95, 1.0))
 
-    def evaluated(*arguments: Any, **named: Any) -> EvaluationRecord:
-        return replace(evaluate(*arguments, **named), success=next(found))
+    def evaluated(*arguments: Any, **named: Any) -> tuple[EvaluationRecord, Drives]:
+        record, driven = evaluate(*arguments, **named)
+        return replace(record, success=next(found)), driven
 
     monkeypatch.setattr(loop, "evaluate_policy", evaluated)
     folder = tmp_path / "run"

@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,13 @@ import pytest
 import wandb
 import yaml
 
+import evaluate
+from mpfa_envs.evaluation.runs import Filtered
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.finished import is_finished
 from training.records import EpisodeRecord, EvaluationRecord
+from training.run import showing
 from training.run.checkpoints import save
 from training.run.loop import TrainingRun
 from training.run.showing import show_policy
@@ -75,7 +79,7 @@ def episode(number: int, *, actions: int) -> EpisodeRecord:
 
 
 def test_episodes_that_end_at_one_action_are_all_in_the_log(tmp_path: Path, kept: Kept) -> None:
-    run: Any = None
+    run: Any = SimpleNamespace(driven=None)
     tracker = Tracker(TrainSettings(tracking=OFFLINE), tmp_path, run_id=None)
     for number, actions in enumerate((160, 160, 160, 176)):
         tracker.on_episode(run, episode(number, actions=actions))
@@ -259,6 +263,55 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
     assert artifact.metadata["method"] == "mpfa_per"
     assert artifact.metadata["episodes"] == 1
     assert list(artifact.manifest.entries) == [files.POLICY]
+
+
+@pytest.mark.parametrize("every", [None, 0])
+def test_an_evaluation_is_logged_with_its_paths_unless_no_pictures_are_asked_for(
+    every: int | None, tmp_path: Path, kept: Kept
+) -> None:
+    settings = tiny(episodes=[Stage("A", 2)])
+    settings.tracking = replace(OFFLINE, pictures_every=every)
+    settings.evaluation = replace(settings.evaluation, world="A", every=10, episodes=2)
+    train(tmp_path, settings)
+    found = [row for row in kept.rows.values() if "evaluation/success" in row]
+    assert found and all(("evaluation/paths" in row) == (every == 0) for row in found)
+
+
+def test_what_evaluate_py_finds_is_in_the_wandb_run_of_the_training(
+    tmp_path: Path, kept: Kept, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tiny(episodes=[Stage("A", 1)])
+    settings.tracking = replace(OFFLINE, pictures_every=None)
+    run = train(tmp_path, settings)
+    before = len(kept.rows)
+    how = [str(tmp_path), "--worlds", "A", "B", "--episodes", "2"]
+    total = evaluate.main([*how, "--no-pictures"]).iloc[-1]
+    *_, row = kept.rows.values()
+    assert len(kept.rows) == before + 1 and row["actions"] == run.actions
+    assert row["evaluate/A+B-kinematic/success"] == total["success"]
+    assert [line[0] for line in row["evaluate/A+B-kinematic/worlds"].data] == ["A", "B", "total"]
+    assert "evaluate/A+B-kinematic/paths" not in row
+    assert f"in wandb, too: wandb sync {tmp_path}/wandb/offline-run-" in capsys.readouterr().out
+    # A run without wandb begins none.
+    (tmp_path / "wandb").rename(tmp_path / "elsewhere")
+    evaluate.main([*how, "--no-pictures"])
+    assert len(kept.rows) == before + 1 and not (tmp_path / "wandb").exists()
+
+
+def test_pictures_of_a_policy_that_needs_the_filter_are_made_behind_it(
+    tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drivers: list[object] = []
+    drive = showing.drive
+    monkeypatch.setattr(
+        showing, "drive", lambda driver, *a, **k: drivers.append(driver) or drive(driver, *a, **k)
+    )
+    settings = tiny(episodes=[Stage("A", 1)])
+    settings.tracking = replace(OFFLINE)
+    settings.evaluation = replace(settings.evaluation, world="A", episodes=1)
+    settings.environment = replace(settings.environment, robot="kobuki", filter=1.0)
+    train(tmp_path, settings)
+    assert [type(driver) for driver in drivers] == [Filtered]
 
 
 @pytest.mark.parametrize(

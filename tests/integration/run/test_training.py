@@ -28,6 +28,7 @@ from tests.integration.tiny_runs import (
 from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import ALIASES, METHODS
 from torchrl_mpfa.saving import save_atomically
+from training.evaluating import Drives
 from training.files import CHECKPOINT
 from training.records import EvaluationRecord
 from training.run import checkpoints, loop
@@ -309,9 +310,10 @@ def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for
     # Of equal successes the one with the highest SCT, whatever its SPL.
     scores = iter(((0.2, 0.9, 0.9), (0.9, 0.5, 0.1), (0.9, 0.4, 0.8)))
 
-    def evaluated(*arguments: Any, **named: Any) -> EvaluationRecord:
+    def evaluated(*arguments: Any, **named: Any) -> tuple[EvaluationRecord, Drives]:
         success, sct, spl = next(scores, (0.5, 0.9, 0.9))
-        return replace(found(*arguments, **named), success=success, sct=sct, spl=spl)
+        record, driven = found(*arguments, **named)
+        return replace(record, success=success, sct=sct, spl=spl), driven
 
     monkeypatch.setattr(loop, "evaluate_policy", evaluated)
     settings = tiny()
