@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,22 +29,17 @@ from mpfa_envs import (
     TaskConfig,
     evaluate,
     make_navigation_env,
-    navigation_reward,
     save_policy,
 )
 from mpfa_envs.evaluation.runs import Filtered
 
 SENSES: dict[str, Any] = {
-    "robot": "kobuki",
-    "physics": "kinematic",
-    "memory": "map",
+    **{name: ROOMS_TASK[name] for name in ("robot", "physics", "memory")},
     # Of the radius: a robot that can stop must know how near it is.
     "closeness_distance": 0.18,
 }
 """What a policy must find again wherever it drives: how the robot moves and senses."""
-# A robot that can stand still has to be told that time costs something.
-REWARD = partial(navigation_reward, step_cost=0.05)
-TASK = {**ROOMS_TASK, **SENSES, "clearance": 0.02, "reward": REWARD}
+TASK = {**ROOMS_TASK, **SENSES}
 ROBOTS = 16
 STEPS = 8
 """Actions of each robot between two rounds of updates."""

@@ -24,7 +24,9 @@ from tqdm import tqdm
 import torchrl_mpfa as mpfa
 from mpfa_envs import ROOMS_TASK, Mirror, VectorNavigationEnv, evaluate, make_navigation_env
 
-TASK = {**ROOMS_TASK, "world": "bars", "memory": "none"}
+# The paper's robot sees only the half before it, and cannot stop.
+_PAPERS = {"robot": "turtlebot2", "clearance": 0.05, "reward": None}
+TASK = {**ROOMS_TASK, **_PAPERS, "world": "bars", "memory": "none"}
 ROBOTS = 16
 STEPS = 8
 """Actions of each robot between two rounds of updates."""

@@ -27,7 +27,7 @@ from torch import nn
 
 from mpfa_envs import ROOMS_TASK, Policy, VectorNavigationEnv, save_policy
 
-SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "clearance")}
+SENSES = {name: ROOMS_TASK[name] for name in ("robot", "physics", "memory", "clearance")}
 """Arguments of the environment that a policy needs wherever it drives."""
 _NOISE = 0.2
 """Standard deviation of TD3's exploration."""

@@ -58,7 +58,7 @@ ACTIONS_PER_UPDATE = 4
 """Actions of all robots together."""
 FRAMES = 64
 """Actions between two rounds of updates."""
-SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "clearance")}
+SENSES = {name: ROOMS_TASK[name] for name in ("robot", "physics", "memory", "clearance")}
 """Arguments of the environment that a policy needs wherever it drives."""
 RUN, REPLAY, SCORES = "run.pt", "replay", "scores.csv"
 

@@ -135,7 +135,7 @@ def test_what_is_no_robot_is_rejected(robot: Any, message: str) -> None:
 
 def test_each_part_takes_the_file() -> None:
     file = str(EXAMPLE_ROBOT)
-    env = VectorNavigationEnv(2, robot=file, **ROOMS_TASK)
+    env = VectorNavigationEnv(2, **ROOMS_TASK | {"robot": file})
     made = [env.config.robot, make_planner("dwa", robot=file).robot]
     made += [
         make_planner("astar", robot=file).robot,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -17,10 +18,12 @@ from mpfa_envs import (
     TaskConfig,
     VectorNavigationEnv,
     generate_world,
+    navigation_reward,
 )
 from mpfa_envs.generators.generate import generator_tasks
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.observation import INFO_TYPES
+from mpfa_envs.tasks.reward import payments_of
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
 
@@ -37,8 +40,12 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
     assert isinstance(env, NavigationEnv)
     assert isinstance(many, VectorNavigationEnv)
     for name, value in ROOMS_TASK.items():
-        if name not in ("world", "max_goal_distance"):
-            assert getattr(env.config, name) == getattr(many.config, name) == value
+        if name not in ("world", "max_goal_distance", "reward"):
+            wanted = ROBOTS["kobuki"] if name == "robot" else value
+            assert getattr(env.config, name) == getattr(many.config, name) == wanted
+    # Gymnasium copies what it makes an environment with.
+    paid = [payments_of(each.config.reward_function) for each in (env, many)]
+    assert paid == [payments_of(partial(navigation_reward, step_cost=0.05))] * 2
     assert env.observation_space == many.single_observation_space
     # The same worlds, if each robot has the seed itself.
     many.reset(seed=[5, 6, 7])
@@ -52,12 +59,12 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
 @pytest.mark.parametrize("robot", [*ROBOTS, replace(ROBOTS["kobuki"], name="cart", radius=0.28)])
 def test_the_task_keeps_its_clearance_of_the_rim_of_each_robot(robot: RobotChoice) -> None:
     task = TaskConfig(
-        **{name: ROOMS_TASK[name] for name in ROOMS_TASK.keys() - {"world", "max_goal_distance"}},
-        robot=robot,
+        **{name: ROOMS_TASK[name] for name in ROOMS_TASK.keys() - {"world", "max_goal_distance"}}
+        | {"robot": robot}
     )
     radius = resolve_robot(robot).radius
-    assert task.collision_distance == pytest.approx(radius + 0.05, abs=1e-12)
-    assert task.closeness_distance == pytest.approx(radius + 0.05, abs=1e-12)
+    assert task.collision_distance == pytest.approx(radius + 0.02, abs=1e-12)
+    assert task.closeness_distance == pytest.approx(radius + 0.02, abs=1e-12)
     judged = replace(task, contact=True)
     assert (judged.collision_distance, judged.closeness_distance) == (
         radius,

@@ -91,7 +91,7 @@ def test_an_interrupted_run_saves_and_resumes(
 
 
 def test_the_policy_acts_as_the_actor_does() -> None:
-    env = make_navigation_env(num_envs=3, memory="map", physics="kinematic", seed=0)
+    env = make_navigation_env(num_envs=3, seed=0, **torchrl_sac.SENSES)
     network, actor, _ = torchrl_sac.make_networks(env)
     state = env.reset()
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.tasks.reward import navigation_reward
 from mpfa_envs.worlds.builtin import WORLDS
 
 if TYPE_CHECKING:
@@ -22,20 +24,22 @@ _WORLD_OF = {
 }
 ENV_IDS = tuple(_WORLD_OF)
 """The ids of worlds and of generators that ``gymnasium.make`` and ``gymnasium.make_vec`` know once
-this package is imported; ``mpfa/Rooms-v1`` is that of ``regime=rooms`` for the paper's robot."""
+this package is imported; ``mpfa/Rooms-v1`` is that of ``regime=rooms``."""
 ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "world": "mixed",
+        "robot": "kobuki",
         "physics": "kinematic",
         "progress": "shortest_path",
         "max_goal_distance": 20.0,
         "memory": "map",
-        "clearance": 0.05,
+        "clearance": 0.02,
+        # A robot that can stand still has to be told that time costs something.
+        "reward": partial(navigation_reward, step_cost=0.05),
     }
 )
 """Arguments of :class:`~mpfa_envs.NavigationEnv` and :class:`~mpfa_envs.VectorNavigationEnv` for
-the task of ``regime=rooms`` for the paper's robot, without a filter and a cost of time, hence with
-more clearance: those of ``mpfa/Rooms-v1``."""
+the task of ``regime=rooms`` without a filter: those of ``mpfa/Rooms-v1``."""
 
 
 def make_vector(
