@@ -80,8 +80,8 @@ def world_tasks(
             each world of the benchmark. The first tasks of a longer list are those of a shorter
             one.
         seed: Seed of the tasks in a world; those of a generator are fixed.
-        robot: Whose radius counts in a world. Those of a generator are for a TurtleBot2, and a slower
-            robot has more time for them.
+        robot: Whose radius counts in a world. Those of a generator are for a TurtleBot2, and a
+            slower robot has more time for them.
 
     Returns:
         The tasks with their worlds.
