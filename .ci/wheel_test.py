@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tempfile
 import venv
 import zipfile
@@ -80,11 +81,18 @@ def build(folder: Path) -> Path:
 
     Returns:
         The wheel.
+
+    Raises:
+        SystemExit: If the sdist has results.
     """
     # hatchling is in this environment: building needs no other one, and no network.
     _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT))
     (sdist,) = folder.glob("*.tar.gz")
     (wheel,) = folder.glob("*.whl")
+    with tarfile.open(sdist) as archive:
+        results = [name for name in archive.getnames() if "/docs/results" in name]
+    if results:
+        raise SystemExit(f"the sdist has {len(results)} files of results: {results[:3]}")
     print(f"built {sdist.name} and {wheel.name}", flush=True)
     return wheel
 

@@ -110,7 +110,11 @@ def frozen_buffers(folder: Path = FOLDER) -> list[FrozenBuffer]:
     """Return the buffers of a folder by name, and raise without any."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
-        raise FileNotFoundError(f"no frozen buffers in {folder}: `capture` makes them")
+        raise FileNotFoundError(
+            f"no frozen buffers in {folder}: they come with the repository"
+            " in docs/results/values, not with a release; `python -m benchmarks.values capture`"
+            " makes them"
+        )
     return [read_frozen(path) for path in paths]
 
 
