@@ -69,7 +69,7 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unse
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
 	$(BIN)/python examples/train.py regime=$(REGIME) $(PHYSICS) $(ARGS)
 
-paper: $(STAMP) ## Write docs/paper.md and its figures from the kept rows of the paper's runs
+paper: $(STAMP) ## Write docs/results/paper.md and its figures from the kept rows of the paper's runs
 	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 test: $(DEV) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects

@@ -290,8 +290,8 @@ WORD = re.compile(r"[A-Za-z][A-Za-z'’-]*|\d[\d.,]*")
 NUMBER = re.compile(r"(?<![A-Za-z])[\d−-]?\d[\d.,]*")
 FEWEST_WORDS = 4
 """Words of the shortest sentence; fewer are a label."""
-RESULTS = ("results.md", "results/", "paper.md", "study.md", "values.md", "cliffwalk.md")
-GUIDES = ("results.md", "results/changes.md", "study.md")
+RESULTS = ("results.md", "results/", "values.md")
+GUIDES = ("results.md", "results/changes.md", "results/study.md")
 """Pages of results that lead to others, or say how they were made."""
 LIMITS = {"readme": (15.0, 0.05, 0.2), "page": (15.0, 0.05, 0.3), "results": (18.0, 0.08, 0.8)}
 """Words a sentence, share of sentences of more than thirty words, numbers a sentence."""

@@ -1,6 +1,6 @@
 """``python -m benchmarks.paper [COMMAND]``: the paper's tables and figures, made again.
 
-    python -m benchmarks.paper                 write docs/paper.md from the rows that are kept
+    python -m benchmarks.paper                 write docs/results/paper.md from the rows that are kept
     python -m benchmarks.paper run             make the runs that have no rows yet; eight hours
     python -m benchmarks.paper time            make the runs of Table 3's times, one at a time
     python -m benchmarks.paper keep            add the rows of finished runs, and make none
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--folder", type=Path, default=Path("runs/paper"), help="of runs (default: runs/paper)"
     )
     parser.add_argument("--rows", type=Path, help="folder of rows")
-    parser.add_argument("--output", type=Path, help="folder of the page (default: docs)")
+    parser.add_argument("--output", type=Path, help="folder of the page (default: docs/results)")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     options = parser.parse_args(arguments)
     if options.jobs < 1:
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _write(rows: Path, output: Path | None) -> int:
     """Write the page; the figures of the kept rows lie next to these."""
-    page = (output or Path("docs")) / "paper.md"
+    page = (output or FOLDER.parent) / "paper.md"
     for path in write_page(read_rows(rows), page, output or FOLDER):
         print(f"written: {path}")
     return 0

@@ -82,7 +82,7 @@ _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
     python -m benchmarks.paper time --folder runs/paper
     make paper ARGS='--rows runs/paper/rows --output runs/paper'"""
-_KEPT = "`make paper` alone writes it from [the rows that are kept](results/paper)."
+_KEPT = "`make paper` alone writes it from [the rows that are kept](paper)."
 
 
 def write_page(rows: Rows, page: Path, pictures: Path) -> list[Path]:

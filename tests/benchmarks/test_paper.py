@@ -98,9 +98,9 @@ def test_every_planned_run_that_is_kept_has_two_hundred_tests_and_its_episodes()
 
 def test_page_is_that_of_the_kept_rows(tmp_path: Path) -> None:
     rows = read_rows(ROOT / "docs/results/paper")
-    write_page(rows, tmp_path / "docs/paper.md", tmp_path / "docs/results/paper")
-    made = (tmp_path / "docs/paper.md").read_text(encoding="utf-8")
-    assert made == (ROOT / "docs/paper.md").read_text(encoding="utf-8")
+    write_page(rows, tmp_path / "docs/results/paper.md", tmp_path / "docs/results/paper")
+    made = (tmp_path / "docs/results/paper.md").read_text(encoding="utf-8")
+    assert made == (ROOT / "docs/results/paper.md").read_text(encoding="utf-8")
     for path in (tmp_path / "docs/results/paper").glob("*.png"):
         with (
             Image.open(path) as picture,

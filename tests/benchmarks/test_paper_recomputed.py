@@ -1,4 +1,4 @@
-"""Numbers of docs/paper.md, recomputed from the kept rows by code that imports nothing of ours."""
+"""Numbers of docs/results/paper.md, recomputed from the kept rows by code that imports nothing of ours."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def student(values: list[float]) -> list[float]:
 
 
 def text_of(title: str) -> str:
-    page = (DOCS / "paper.md").read_text(encoding="utf-8")
+    page = (DOCS / "results/paper.md").read_text(encoding="utf-8")
     return next(part for part in page.split("\n## ") if part.startswith(title))
 
 
