@@ -165,7 +165,7 @@ TASK_PAGES = [
 ]
 ELSEWHERE = [
     *("methods/README.md", "methods/her.md"),
-    *("torchrl_trainer.md", "tuning.md", "values.md"),
+    *("torchrl_trainer.md", "results/values.md", "tuning.md"),
 ]
 """Pages whose code is run by the tests of what they are about."""
 
@@ -290,7 +290,7 @@ WORD = re.compile(r"[A-Za-z][A-Za-z'’-]*|\d[\d.,]*")
 NUMBER = re.compile(r"(?<![A-Za-z])[\d−-]?\d[\d.,]*")
 FEWEST_WORDS = 4
 """Words of the shortest sentence; fewer are a label."""
-RESULTS = ("results.md", "results/", "values.md")
+RESULTS = ("results.md", "results/")
 GUIDES = ("results.md", "results/changes.md", "results/study.md")
 """Pages of results that lead to others, or say how they were made."""
 LIMITS = {"readme": (15.0, 0.05, 0.2), "page": (15.0, 0.05, 0.3), "results": (18.0, 0.08, 0.8)}

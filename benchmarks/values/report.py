@@ -52,7 +52,7 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         HEAD,
         f"{rows['buffer'].nunique()} buffers, {count} seeds in each. "
         f"Differences to `{AGAINST}` are of the same buffers and seeds, with 95 % intervals over "
-        "buffers. RMSE is in per cent of that of PER. [What is measured](../../values.md).",
+        "buffers. RMSE is in per cent of that of PER. [What is measured](../values.md).",
         "## Planned comparisons",
         planned_table(planned),
         "## All arms",

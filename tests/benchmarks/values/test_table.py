@@ -72,7 +72,7 @@ def test_methods_are_compared_on_a_buffer(walk: FrozenBuffer, monkeypatch) -> No
 
 def test_the_ten_lines_of_the_page_compare_a_signal_of_ones_own(monkeypatch, capsys) -> None:
     monkeypatch.setattr(running, "learn", partial(learn, marks=(4, 8)))
-    text = (FOLDER.parents[1] / "values.md").read_text(encoding="utf-8")
+    text = (FOLDER.parent / "values.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     exec(code.replace("seeds=range(6)", "seeds=range(2)"), names := {})
     assert list(names["found"].index) == ["mine"]
