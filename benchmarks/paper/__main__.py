@@ -1,6 +1,6 @@
 """``python -m benchmarks.paper [COMMAND]``: the paper's tables and figures, made again.
 
-    python -m benchmarks.paper                 write docs/results/paper.md from the rows that are kept
+    python -m benchmarks.paper                 write docs/results/paper.md from the kept rows
     python -m benchmarks.paper run             make the runs that have no rows yet; eight hours
     python -m benchmarks.paper time            make the runs of Table 3's times, one at a time
     python -m benchmarks.paper keep            add the rows of finished runs, and make none

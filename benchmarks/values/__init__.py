@@ -2,8 +2,8 @@
 
 Buffer and policy of a run are frozen, and critics learn from scratch with each replay method. What
 they should have learned is known, and no luck of exploration is in it: a few seeds of some seconds
-tell methods apart that hundreds of whole runs do not. ``docs/results/values.md`` has the results, and how
-to test a signal or sampler of one's own in a minute.
+tell methods apart that hundreds of whole runs do not. ``docs/results/values.md`` has the results,
+and how to test a signal or sampler of one's own in a minute.
 """
 
 from benchmarks.values.arms import ARMS as ARMS

@@ -5,7 +5,7 @@
     python -m benchmarks.values run per mpfa_per --seeds 3    two arms, three seeds
     python -m benchmarks.values report            its page and figures
 
-``run`` continues where it was stopped. ``docs/results/values.md`` shows how to test a signal of your own.
+``run`` continues where it was stopped. ``docs/results/values.md`` tests a signal of your own.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Numbers of docs/results/paper.md, recomputed from the kept rows by code that imports nothing of ours."""
+"""Numbers of the paper's page, recomputed from the kept rows by code that imports nothing of ours."""
 
 from __future__ import annotations
 
