@@ -1,4 +1,4 @@
-"""Numbers of the paper's page, recomputed from the kept rows by code that imports nothing of ours."""
+"""Numbers of the paper's page, made again from the kept rows by code that imports none of ours."""
 
 from __future__ import annotations
 
