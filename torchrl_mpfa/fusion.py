@@ -226,7 +226,7 @@ class EntropyFusion:
         population: Transitions that the probabilities are counted over: the whole ``"buffer"``
             (default), or the ``"batch"``, which prioritized sampling biases.
         positive_above: See :func:`positive_entropy`. With ``"mean"`` both events are one, hence all
-            weights equal, whatever the data.
+            weights equal for any data.
         floor: Smallest weight a signal may get before the weights are normalized again; 0 is the
             paper, whose TD weight vanishes once all rewards are positive.
 
@@ -257,7 +257,7 @@ class EntropyFusion:
         if self.positive_above == "mean":
             warnings.warn(
                 "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
-                "all signals get equal weights, whatever the data. With a number between the "
+                "all signals get equal weights for any data. With a number between the "
                 "rewards the weights follow the data",
                 stacklevel=3,
             )

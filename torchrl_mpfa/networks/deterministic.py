@@ -3,7 +3,7 @@
 Plain multi-layer perceptrons were seen to saturate the actor's tanh within some fifty episodes:
 the robot then circles. The defaults follow the original DDPG paper (Lillicrap et al. 2016,
 https://arxiv.org/abs/1509.02971: the action joins the critic at its second layer, last layers
-start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
+start near zero) and add LayerNorm. ``docs/tuning.md`` has the reason of each.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class SignalSampler(TreeSampler):
         adjustments: Changes of the fused priorities, in order.
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities again; 0 counts at every update. The default costs a constant time per
-            written transition, whatever the capacity.
+            written transition, for any capacity.
         **kwargs: Further arguments.
 
     Raises:

@@ -28,7 +28,7 @@ class MPFASampler(SignalSampler):
             paper), or ``"mean"``, the mean reward of the buffer. It holds for the entropy of Eq.
             (17), the boost and the decay alike. Where all rewards have one sign, 0 makes all of
             them the same: the TD error and the gradient then get no weight. With ``"mean"`` the
-            three weights are equal, whatever the data.
+            three weights are equal for any data.
         **kwargs: As :class:`SignalSampler`, all of whose arguments are taken. Those that are not
             given are the paper's: its three signals, :class:`~torchrl_mpfa.EntropyFusion`,
             :class:`~torchrl_mpfa.PositiveBoost` and :class:`~torchrl_mpfa.PositiveDecay`, and the

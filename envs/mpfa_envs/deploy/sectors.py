@@ -176,8 +176,8 @@ class Sectors:
             scan: What the lidar has measured.
 
         Returns:
-            What is in all directions, in the policy's field of view or not: 0 m for what is too
-            near to be measured, whatever ``range_min`` is, and NaN for a ray that is not valid.
+            Points in all directions, in the policy's field of view or not: 0 m for an obstacle
+            nearer than ``range_min``, and NaN for a ray that is not valid.
 
         Raises:
             ScanError: If it is no scan.
@@ -191,7 +191,7 @@ class Sectors:
         )
 
     def blind(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Find where a scan does not look, whatever ``unseen`` says of these directions.
+        """Find the directions in which a scan does not look, ``unseen`` notwithstanding.
 
         Args:
             scan: What the lidar has measured.

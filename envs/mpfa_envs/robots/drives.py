@@ -35,7 +35,7 @@ class Drives:
         self._limits = robot.wheel_limits
         self._time_step = time_step
         self.commands = np.zeros((robots, 2))
-        """Speeds that the wheels have by now been told, as fast as they may change [m/s]."""
+        """Speeds ordered of the wheels so far, as fast as they may change [m/s]."""
 
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""

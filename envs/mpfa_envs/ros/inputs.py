@@ -27,7 +27,7 @@ _MOVED: Final = 0.05, 0.1
 _LAG: Final = 0.25
 """Odometry may lag behind the scans by this, and show a standing robot as driving [s]."""
 _PUSHED: Final = 0.5
-"""A robot that was told to drive this far must have moved [m]."""
+"""A robot with orders to drive this far must have moved [m]."""
 _GAP: Final = 0.5
 """Longest time between two odometries that counts [s]."""
 
@@ -226,13 +226,13 @@ class Track:
         return ""
 
     def _stall(self, felt: Felt, ordered: float) -> str:
-        """The distance ordered while it stood; empty if it moves as it is told."""
+        """Return the distance ordered while the robot stood; empty if it moves as ordered."""
         self._pushed += abs(ordered) * min(max(felt.time - self._past[-1].time, 0.0), _GAP)
         if not ordered or self._from is None or _moved(self._from, felt.pose):
             self._pushed, self._from = 0.0, felt.pose
         if self._pushed <= _PUSHED:
             return ""
-        return f"odometry stands still: told to drive {self._pushed:.1f} m"
+        return f"odometry stands still: ordered to drive {self._pushed:.1f} m"
 
 
 def _moved(start: Pose | None, end: Pose) -> bool:

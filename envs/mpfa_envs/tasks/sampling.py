@@ -210,7 +210,7 @@ def evaluation_pairs(
         n: Number of tasks.
         seed: Seed of the sampling; the first tasks of a longer list are those of a shorter one.
         robot: The robot, whose rim keeps the paper's clearance of 0.17 m at the start, at the goal
-            and on a path between them, whatever it trained with.
+            and on a path between them, for any clearance of its training.
         min_goal_distance: Least distance between start and goal [m].
 
     Returns:

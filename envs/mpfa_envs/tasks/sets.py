@@ -37,7 +37,7 @@ class WorldTask(NamedTuple):
     world: World
     task: Task
     max_steps: int | None = None
-    """Time limit in steps of 0.1 s, whatever the environment's; None: that of the environment."""
+    """Time limit in steps of 0.1 s, in place of the environment's; None: the environment's."""
     seed: int | None = None
     """Seed of walkers and noise; None: the number of the task among those that are driven."""
     reference_path: float | None = None

@@ -12,7 +12,7 @@ _COMPILE: Rule = (lambda value: value in ("auto", True, False), "auto, true or f
 
 @dataclass
 class LearnerSettings:
-    """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
+    """DDPG of Table 1, with what keeps it from collapsing (see ``docs/tuning.md``)."""
 
     name: str = setting("ddpg", NAME)
     """Part of the run's folder and of its group in wandb."""
