@@ -90,7 +90,7 @@ def build(folder: Path) -> Path:
     (sdist,) = folder.glob("*.tar.gz")
     (wheel,) = folder.glob("*.whl")
     with tarfile.open(sdist) as archive:
-        results = [name for name in archive.getnames() if "/docs/results" in name]
+        results = [name for name in archive.getnames() if "/docs/results/" in name]
     if results:
         raise SystemExit(f"the sdist has {len(results)} files of results: {results[:3]}")
     print(f"built {sdist.name} and {wheel.name}", flush=True)
