@@ -82,7 +82,13 @@ _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
     python -m benchmarks.paper time --folder runs/paper
     make paper ARGS='--rows runs/paper/rows --output runs/paper'"""
-_KEPT = "`make paper` alone writes it from [the rows that are kept](paper)."
+_KEPT = "`make paper` alone writes it from [the rows that are kept](paper):"
+_FILES = [
+    ["`tests.csv.gz`", "a test of a last policy"],
+    ["`curves.csv.gz`", "an evaluation during training"],
+    ["`episodes/RUN.csv.gz`", "a training episode"],
+    ["`times.csv`", "training time of a run that had the machine to itself [min]"],
+]
 
 
 def write_page(rows: Rows, page: Path, pictures: Path) -> list[Path]:
@@ -148,6 +154,7 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_MADE),
             _COMMANDS,
             _KEPT,
+            table(["file", "a row"], _FILES),
             *(["Runs that are missing:", missing_table(missing)] if missing else []),
         ]
     )
