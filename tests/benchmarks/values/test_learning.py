@@ -136,7 +136,9 @@ def test_a_buffer_is_read_as_it_was_written(walk: FrozenBuffer, tmp_path: Path) 
 
 
 def test_a_folder_without_buffers_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no frozen buffers in .* come with the repository"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no frozen buffers in .* come with the repository"
+    ):
         frozen_buffers(tmp_path)
 
 
