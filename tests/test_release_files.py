@@ -11,12 +11,20 @@ from pathlib import Path
 import pytest
 import yaml
 
+import torchrl_mpfa
+
 ROOT = Path(__file__).resolve().parent.parent
 TOOLS = ("sh", "dirname", "mktemp", "rm", "xargs", "cp", "git")
 
 
 def lines(name: str) -> list[str]:
     return (ROOT / name).read_text(encoding="utf-8").splitlines()
+
+
+def test_citation_and_changelog_have_the_version_of_the_package() -> None:
+    version, *_ = re.findall(r"^## \[([\d.]+)\]", "\n".join(lines("CHANGELOG.md")), re.MULTILINE)
+    assert f"version: {version}" in lines("CITATION.cff")
+    assert version == torchrl_mpfa.__version__
 
 
 def test_the_hosted_checks_are_those_of_the_repository() -> None:
