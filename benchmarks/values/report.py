@@ -111,10 +111,10 @@ def arm_table(rows: pd.DataFrame) -> str:
         differences(rows[rows["buffer"].str.startswith(reward)], against=AGAINST)
         for reward in REWARDS
     ]
-    drawn = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
+    sampled = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
     head = (
         *("", "RMSE, long training", "p", *REWARDS, "rank correlation"),
-        *("RMSE, returns", "rank correlation, returns", "effective sample", "goals drawn"),
+        *("RMSE, returns", "rank correlation, returns", "effective sample", "goals sampled"),
     )
     cells = [
         [
@@ -130,7 +130,7 @@ def arm_table(rows: pd.DataFrame) -> str:
         ]
         for name, row in found.iterrows()
     ]
-    own = [f"{drawn['effective'].mean():.0%}", f"{drawn['goals'].mean():.1%}"]
+    own = [f"{sampled['effective'].mean():.0%}", f"{sampled['goals'].mean():.1%}"]
     cells.append([f"`{AGAINST}`", *[""] * 7, *own])
     return table(head, cells)
 
@@ -145,11 +145,11 @@ def pair_table(rows: pd.DataFrame) -> str:
             continue
         parts = [two, *(two[two["buffer"].str.startswith(reward)] for reward in REWARDS)]
         found, *by_reward = (_row(differences(part, against=second), first) for part in parts)
-        drawn = two[two["updates"] == two["updates"].max()].groupby("method")["effective"].mean()
+        sampled = two[two["updates"] == two["updates"].max()].groupby("method")["effective"].mean()
         cells.append(
             [
                 f"`{first}` − `{second}`",
-                f"{drawn[first]:.0%}, {drawn[second]:.0%}",
+                f"{sampled[first]:.0%}, {sampled[second]:.0%}",
                 _share(found, "rmse"),
                 _p(found["rmse_p"]),
                 *(_share(each, "rmse") for each in by_reward),
