@@ -83,11 +83,28 @@ def test_an_interrupted_run_saves_and_resumes(
     assert torch.get_rng_state().equal(state["random"])
     saved = state["loss"]
     assert all(value.equal(saved[name]) for name, value in run.loss.state_dict().items())
+    moments = run.optimizer.state_dict()["state"]
+    assert moments
+    for name, kept in state["optimizer"]["state"].items():
+        assert moments[name]["exp_avg"].equal(kept["exp_avg"])
     torchrl_sac.main(["--resume", str(folder), "--actions", "256", "--every", "64"])
     assert list(pd.read_csv(folder / "scores.csv")["steps"]) == [64, 128, 192, 256]
     with pytest.raises(SystemExit):
         torchrl_sac.main(pendulum(folder))
     assert f"holds a run: --resume {folder}" in capsys.readouterr().err
+
+
+def test_an_update_moves_targets_and_priorities_and_an_evaluation_has_no_noise() -> None:
+    own = {"task": "Pendulum-v1", "replay": "mpfa", "robots": 1, "seed": 0}
+    run = torchrl_sac.Training(own)
+    run.buffer.extend(run.env.rollout(64))
+    before = {k: v.clone() for k, v in run.loss.state_dict().items() if k.startswith("target")}
+    run.update()
+    after = run.loss.state_dict()
+    assert any(not value.equal(after[name]) for name, value in before.items())
+    assert all(each.grad is None for each in run.loss.parameters())
+    assert run.buffer.stats()["share/td_error"] > 0
+    assert run.evaluate(1) == run.evaluate(1)
 
 
 def test_the_policy_acts_as_the_actor_does() -> None:
