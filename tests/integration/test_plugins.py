@@ -76,6 +76,10 @@ def tiny_run(mine: Path) -> list[str]:
 def test_names_of_a_plugin_are_those_of_a_run(mine: Path, tmp_path: Path) -> None:
     words, path = with_plugin(["seed=3", "--plugin", str(mine)])
     assert words == ["seed=3", f"plugin={mine}"] and path == str(mine)
+    (other := mine.with_name("other_of_a_test.py")).write_text("")
+    with pytest.raises(ValueError, match=r"plugin must be one file, got .*mine.* and .*other"):
+        with_plugin([f"plugin={mine}"], str(other))
+    sys.modules.pop(other.stem)
     register()
     (settings,) = composed([*tiny_run(mine), "seed=3"])
     run = train_tiny(tmp_path / "run", settings)
