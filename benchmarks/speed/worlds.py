@@ -28,6 +28,8 @@ DISTANCE = 0.25
 WORLDS = 60
 """Worlds of a generator that are measured in turn."""
 _MILLISECONDS = 1e3
+_FIELD = 5.0
+"""Length of a BARN world's field, with half a meter of the corridor before it [m]."""
 
 
 def _new_world(name: str) -> Call:
@@ -93,12 +95,14 @@ def render_all(
 
 
 def course_of(world: World) -> World:
-    """A world of BARN, cut to its corridor and the field across it."""
+    """A world of BARN, cut to the field across its corridor, which is empty before it."""
     centers = np.array([(each.x, each.y) for each in world.cylinders])
     low, high = centers.min(axis=0), centers.max(axis=0)
+    low[1] = high[1] - _FIELD
     x, y = (low + high) / 2
     width, depth = high - low + 0.4
-    moved = tuple(replace(each, x=each.x - x, y=each.y - y) for each in world.cylinders)
+    inside = [each for each in world.cylinders if each.y >= low[1]]
+    moved = tuple(replace(each, x=each.x - x, y=each.y - y) for each in inside)
     return World(name=world.name, size=(width, depth), cylinders=moved)
 
 
@@ -113,7 +117,7 @@ def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:
     if names:
         return
     worlds = [course_of(barn_world(index)) for index in range(8, 20)]
-    Image.fromarray(render_all(worlds, columns=6)).quantize(64).save(folder / "barn.png")
+    Image.fromarray(render_all(worlds, columns=4)).quantize(64).save(folder / "barn.png")
 
 
 def main() -> None:
