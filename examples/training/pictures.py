@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -79,14 +80,14 @@ def picture_of(world: World, drives: Drives, *, size: int) -> NDArray[np.uint8]:
     )
 
 
-def longest(driven: Sequence[Drives]) -> tuple[int, WorldTask]:
-    """Number and task of the success with the longest way, which shows most; else of a failure."""
+def longest(driven: Sequence[Drives], most: float = math.inf) -> tuple[int, WorldTask]:
+    """Number and task of the longest success of at most this path [m]; else of a failure."""
     episodes: list[tuple[EpisodeResult, int, WorldTask]] = [
         (result, number, task)
         for each in driven
         for number, (result, task) in enumerate(zip(each.results, each.tasks, strict=True))
     ]
-    reached = [each for each in episodes if each[0].success]
+    reached = [each for each in episodes if each[0].success and each[0].path_length <= most]
     _, number, task = max(reached or episodes, key=lambda each: each[0].path_length)
     return number, task
 
