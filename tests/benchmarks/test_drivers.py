@@ -82,6 +82,6 @@ def test_a_folder_without_evaluations_is_rejected(tmp_path, capsys):
 
 def test_the_page_has_the_tables_of_the_kept_rows(capsys):
     drivers.main([str(ROOT / "docs/results/rooms/drivers.csv")])
-    page = (ROOT / "docs/planners.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/results/drivers.md").read_text(encoding="utf-8")
     for table in capsys.readouterr().out.strip().split("\n\n"):
         assert table in page
