@@ -2,8 +2,8 @@
 
 A field has the lengths from all cells, and takes milliseconds however many obstacles there are.
 Moves lead from a free cell to its 16 neighbors, hence a path in the open is up to 1.4 % too long or
-too short. Around corners and in narrow passages the size of the cells adds to it:
-``docs/tasks.md`` has measurements.
+too short. Around corners and in narrow passages the size of the cells adds to it. Beside a search
+among lines of sight the error is 1 % on average, and below 3 % in 95 % of the cases (4 % in mazes).
 
 Centers of free cells keep the distance d. Between two that are a step L apart a path keeps
 √(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
