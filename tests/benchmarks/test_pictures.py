@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks import pictures
+from benchmarks.speed.worlds import course_of
 from mpfa_envs import load_policy
 from mpfa_envs.render import drive_episode
+from mpfa_envs.worlds.barn import barn_world
 from training.evaluating import filtered
+from training.pictures import longest
 
 DOCS = Path(__file__).parents[2] / "docs"
 ANIMATION = DOCS / "images/pictures/episode.gif"
@@ -31,6 +36,22 @@ def test_the_animation_of_the_readme_ends_in_the_goal() -> None:
     # But for the colors of a palette, it is the end of this drive.
     assert shown.shape == last.shape
     assert abs(shown - last).mean() < 3.0
+
+
+def test_a_film_shows_the_longest_success_that_fits() -> None:
+    lengths = ((3.0, True), (14.0, True), (15.0, False), (60.0, True))
+    results = [SimpleNamespace(path_length=each, success=reached) for each, reached in lengths]
+    driven: Any = [SimpleNamespace(results=results, tasks=list("abcd"))]
+    assert longest(driven, most=15.0) == (1, "b")
+    assert longest(driven) == (3, "d")
+
+
+def test_a_world_of_barn_is_pictured_without_its_empty_corridor() -> None:
+    course = course_of(barn_world(8))
+    width, depth = course.size
+    inside = sorted(each.y for each in course.cylinders if abs(each.x) < width / 2 - 0.5)
+    assert -depth / 2 < inside[0] < 1.0 - depth / 2
+    assert np.diff(inside).max() < 1.0
 
 
 def test_the_animation_of_the_readme_is_small_enough_for_a_page() -> None:
