@@ -69,7 +69,7 @@ def test_commands_in_the_docs_name_what_exists() -> None:
     root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
     declared = {each.get("name") for each in root.iter("arg")}
     launches = re.findall(r"ros2 launch (\S+)((?: \w+:=\S+)+)", DOCS)
-    assert len(launches) >= 2
+    assert launches
     for file, words in launches:
         assert (FOLDER / "launch" / file).exists()
         assert set(re.findall(r"(\w+):=", words)) <= declared
