@@ -38,7 +38,7 @@ _LEAST = 1 / 3
 """Share of the clearance that is kept in any case."""
 _TURNS = 0.1
 """Weight of another turn relative to that of another forward speed. The robot steers clear rather
-than stopping: with equal weights it stands before walls (docs/robot.md)."""
+than stopping: with equal weights it stands before walls."""
 _TOUCH = 1e-9
 """Rounding of distances [m]."""
 
