@@ -15,6 +15,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 Trains = Literal["both", "critic", "actor"]
 """The networks that learn from a batch."""
+_TRAINS = get_args(Trains)
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class SampledBatch:
     new_step: bool = True
 
     def __post_init__(self) -> None:
-        if self.trains not in get_args(Trains):
-            raise ValueError(f"trains must be one of {get_args(Trains)}, got {self.trains!r}")
+        if self.trains not in _TRAINS:
+            raise ValueError(f"trains must be one of {_TRAINS}, got {self.trains!r}")
 
     @property
     def gives_signals(self) -> bool:

@@ -7,9 +7,10 @@ a fraction of as many calls; the price is that no batch knows of the updates jus
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
@@ -44,7 +45,8 @@ def run_updates(
         select: Function from the buffer to the batches of an update.
         updates: Number of updates ``U``.
         prepare: Applied to each batch before the learner gets it: to move it to the learner's
-            device, or to add to its rewards. It keeps the rows of the batch and their order.
+            device, or to add to its rewards. It keeps the rows of the batch and their order, and
+            the learner as it is.
 
     Returns:
         Detached values for the log, of the last update; and its last batch with signals, where the
@@ -116,13 +118,14 @@ def _together(
     buffer._warned_batch_size_conflict = True
     sampled = buffer.sample(updates * batch_size)
     home, learned = sampled.device, []
-    for part in sampled.split(batch_size):
-        batch, log = _learn(learner, SampledBatch(part), prepare)
-        learned.append(batch)
+    with getattr(learner, "settled", nullcontext)():
+        for part in sampled.split(batch_size):
+            batch, log = _learn(learner, SampledBatch(part), prepare)
+            learned.append(batch)
     if getattr(buffer, "takes_signals", False):
-        buffer.update_tensordict_priority(_joined(buffer, learned, home), batches=updates)
+        buffer.update_tensordict_priority(_joined(buffer, sampled, learned), batches=updates)
     elif isinstance(buffer.sampler, PrioritizedSampler):
-        buffer.update_tensordict_priority(_joined(buffer, learned, home))
+        buffer.update_tensordict_priority(_joined(buffer, sampled, learned))
     return log, _at(learned[-1], home)
 
 
@@ -137,21 +140,17 @@ def _learn(
 
 
 def _joined(
-    buffer: TensorDictReplayBuffer,
-    batches: Sequence[TensorDictBase],
-    device: torch.device | None,
+    buffer: TensorDictReplayBuffer, sampled: TensorDictBase, batches: Sequence[TensorDictBase]
 ) -> TensorDictBase:
-    """Join the entries of several batches that priorities are made from, shape ``[U * B]``."""
-    sampler = buffer.sampler
-    keys = ["index", buffer.priority_key]
+    """Join what the batches learned to the slots that were sampled, shape ``[U * B]``."""
+    sampler, keys = buffer.sampler, [buffer.priority_key]
     if isinstance(sampler, SignalSampler):
-        learned = [signal.key for signal in sampler.signals if signal.known_at == "update"]
-        keys = ["index", "written_at", *learned]
-    joined = TensorDict({}, [sum(map(len, batches))], device=device)
+        keys = [signal.key for signal in sampler.signals if signal.known_at == "update"]
+    joined = sampled.select("index", "written_at", strict=False)
     for key in keys:
         values = [batch.get(key, None) for batch in batches]
         if all(value is not None for value in values):
-            joined.set(key, torch.cat(values).to(device or "cpu"))
+            joined.set(key, torch.cat(values).to(sampled.device or "cpu"))
     return joined
 
 

@@ -39,8 +39,10 @@ class FlatGroup:
         """Mean and mean square of the gradients, ``[P]`` each."""
         like: dict[str, Any] = {"dtype": torch.float32, "device": self.values.device}
         self._steps = torch.zeros(len(order), **like)
-        self.scales = [torch.ones((), **like) for _ in range(2)]
+        self.scales = torch.ones(2, **like)
         """Step size, and root of the square's correction, of a recorded step."""
+        # Written as an array: operations of PyTorch, cold after a program, take ten times as long.
+        self._scales: Any = self.scales.numpy() if self.scales.is_cpu else self.scales
         self.ready = False
         """True if the moments are those of the optimizer's state."""
 
@@ -50,7 +52,7 @@ class FlatGroup:
 
     def tensors(self) -> list[Tensor]:
         """Return all that a recorded step reads or changes."""
-        return [self.values, self.targets, *self.moments, *self.scales]
+        return [self.values, self.targets, *self.moments, self._steps, self.scales]
 
     def take_moments(self, state: Any) -> bool:
         """Have an optimizer's state view the moments; return False if it is none of one group."""
@@ -76,15 +78,15 @@ class FlatGroup:
             state[parameter] = {"step": step, **dict(zip(_MOMENTS, pair, strict=True))}
 
     def count_step(self, state: Any) -> None:
-        """Count a step, of which the first gives the optimizer its state."""
+        """Count a step that is taken, of which the first gives the optimizer its state."""
         if self.count == 0:
             self._give_moments(state)
         self.count += 1
-        self._steps += 1
 
     def step(self) -> None:
-        """Take a step that was counted, by PyTorch's kernel."""
+        """Take a step, by PyTorch's kernel."""
         group, (mean, square) = self.group, self.moments
+        self._steps += 1
         torch._fused_adam_(
             [self.values],
             [self._gradient()],
@@ -104,8 +106,7 @@ class FlatGroup:
     def scale(self) -> None:
         """Set the scales of the next step, for a program that takes it."""
         first, second = (1.0 - beta ** (self.count + 1) for beta in self.group["betas"])
-        self.scales[0].fill_(self.group["lr"] / first)
-        self.scales[1].fill_(second**0.5)
+        self._scales[0], self._scales[1] = self.group["lr"] / first, second**0.5
 
     def record_step(self, finite: Tensor) -> None:
         """Take a step by operations that can be recorded, and only if the losses are finite."""
@@ -116,7 +117,8 @@ class FlatGroup:
         mean = torch.lerp(self.moments[0], gradient, 1.0 - beta)
         square = beta_of_square * self.moments[1] + (1.0 - beta_of_square) * gradient * gradient
         values = self.values - size * mean / (square.sqrt() / root + self.group["eps"])
-        for old, new in zip((*self.moments, self.values), (mean, square, values), strict=True):
+        kept, moved = (*self.moments, self.values, self._steps), (mean, square, values)
+        for old, new in zip(kept, (*moved, self._steps + 1), strict=True):
             old.copy_(torch.where(finite, new, old))
 
     def _gradient(self) -> Tensor:

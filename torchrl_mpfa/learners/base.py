@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Literal, NoReturn, Protocol, runtime_checkable
 
 import torch
@@ -121,6 +122,7 @@ class OptimizedLearner:
         self._rates = [group["lr"] for group in groups]
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
         self._program: CompiledUpdate | None = None
+        self._is_settled = False
         self._flatten()
         self.updates = 0
         """Training steps taken."""
@@ -129,28 +131,44 @@ class OptimizedLearner:
         self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
     ) -> dict[str, Tensor]:
         """Step the optimizer, and the target networks with the actor; return the log."""
-        if isinstance(self.optimizer, FlatAdam) and not self.optimizer.holds():
-            self._flatten()
-        stepped = None
+        if not self._is_settled:
+            self._look()
         try:
-            if self._program is None:
+            made = None if self._program is None else self._program(batch, trains, loss_function)
+            if made is None:
                 self.clear_gradients()
                 values = self._differentiate(batch, trains, loss_function)
-                log = {name: value.detach() for name, value in values.items()}
-            else:
-                log, stepped = self._program(batch, trains, loss_function)
+                made = {name: value.detach() for name, value in values.items()}, False
         except RuntimeError as error:
             if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
                 raise
             found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
             forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
             raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
+        log, stepped = made
         if not stepped:
             check_losses(log, batch)
             self.optimizer.step()
             if trains != "critic":
                 self.targets.step()
         return log
+
+    def _look(self) -> None:
+        """Follow changes of the loss, and parameters that lie elsewhere now."""
+        if isinstance(self.optimizer, FlatAdam) and not self.optimizer.holds():
+            self._flatten()
+        if self._program is not None:
+            self._program.read_options()
+
+    @contextmanager
+    def settled(self) -> Iterator[None]:
+        """Look once for changes of loss and parameters, which no update inside has to follow."""
+        self._look()
+        self._is_settled = True
+        try:
+            yield
+        finally:
+            self._is_settled = False
 
     def clear_gradients(self) -> None:
         """Let no parameter have a gradient."""
@@ -250,7 +268,7 @@ class ActorCriticLearner(OptimizedLearner):
         compile: True to make one program of the losses and their gradients by ``torch.compile``,
             or the arguments for it. It needs a C++ compiler and half a minute once (the program is
             kept on disk), and takes half of the time for networks of 64 units. The networks must
-            stay on their device.
+            stay on their device. What cannot be compiled stays eager.
 
     Raises:
         TypeError: If the loss writes no signals.

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_non_tensor, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor, fx
 from torch._inductor import config
@@ -59,38 +60,44 @@ class CompiledUpdate:
 
     The program takes the steps of Adam and of the target networks as well. Steps of another
     optimizer, of one with hooks, and of groups of which only a part has gradients are left to the
-    learner: the program then gives gradients.
+    learner: the program then gives gradients. A warning says so, once, or that there is no program.
     """
 
     def __init__(self, learner: Any, compile: dict[str, Any]) -> None:
         _keep_programs()
         self._learner, self._loss = learner, learner.loss
         self._arguments = compile
-        self._programs: dict[Any, Program] = {}
+        self._programs: dict[Any, Program | None] = {}
+        self._warned = False
         self._device = next(self._loss.parameters()).device.type
         self._held: list[Any] = []
         self._options: tuple[Any, ...] = ()
+        self._written: set[NestedKey] = set()
+        """Entries that the loss writes, which a program does not read."""
 
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
-    ) -> tuple[dict[str, Tensor], bool]:
+    ) -> tuple[dict[str, Tensor], bool] | None:
         """Make an update like losses, backward pass and steps do.
 
         Returns:
             The log; and True if the steps were taken, which they are not if a loss is not finite,
-            or if they are left to the learner.
+            or if they are left to the learner. None if the update cannot be recorded.
         """
-        entries = self._entries(batch)
-        self._read_options()
+        # A program is for one layout, which a slice of another tensor has not.
+        written = self._written
+        entries = {k: v.contiguous() for k, v in _leaves(batch) if k not in written}
         precision = torch.is_autocast_enabled(self._device) and torch.get_autocast_dtype(
             self._device
         )
         steps = _records_steps(self._learner.optimizer)
         form = trains, loss_function, precision, steps, self._options, *map(_form, entries.items())
-        program = self._programs.get(form)
-        if program is None:
+        if form not in self._programs:
             made = self._make(entries, batch.batch_size[:1], trains, loss_function, steps)
-            program = self._programs[form] = made
+            self._programs[form] = made
+        program = self._programs[form]
+        if program is None:
+            return None
         for group in program.stepped or ():
             group.scale()
         with torch.no_grad():
@@ -98,7 +105,9 @@ class CompiledUpdate:
         for parameter in program.moved:
             parameter.grad = next(found)
         for key in program.written:
-            batch.set(key, next(found))
+            # Found to fit when the update was recorded; the checks of a batch take half of a write.
+            path = (key,) if isinstance(key, str) else key
+            batch._set_tuple(path, next(found), inplace=False, validated=True, non_blocking=False)
         log = dict(zip(program.log, found, strict=False))
         if program.stepped is None or not next(found).item():
             return log, False
@@ -110,16 +119,7 @@ class CompiledUpdate:
         """Have programs made again: the tensors of the learner lie elsewhere now."""
         self._programs.clear()
 
-    def _entries(self, batch: TensorDictBase) -> Entries:
-        """Return the tensors that a program may read: all but those that the loss writes."""
-        keys = self._loss.tensor_keys
-        written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
-        written |= {keys.value_signal, keys.information_gain_signal}
-        found = batch.items(True, True)
-        # A program is for one layout, which a slice of another tensor has not.
-        return {k: v.contiguous() for k, v in found if isinstance(v, Tensor) and k not in written}
-
-    def _read_options(self) -> None:
+    def read_options(self) -> None:
         """Read the constants of a trace again if one may have changed: options, keys, estimator."""
         loss, estimator = self._loss, self._loss.value_estimator
         parts = loss, estimator, loss.tensor_keys, estimator.tensor_keys
@@ -131,6 +131,9 @@ class CompiledUpdate:
         self._held = held
         plain = [value for value in held if isinstance(value, (bool, int, float, str, tuple))]
         self._options = estimator, *map(id, estimator.buffers()), *plain
+        keys = loss.tensor_keys
+        self._written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
+        self._written |= {keys.value_signal, keys.information_gain_signal}
 
     def _make(
         self,
@@ -139,7 +142,7 @@ class CompiledUpdate:
         trains: Trains,
         loss_function: str | None,
         steps: bool,
-    ) -> Program:
+    ) -> Program | None:
         learner, loss = self._learner, self._loss
         optimizer, stepped = learner.optimizer, None
         # Views of parameters that lie elsewhere now are taken again, and before a trace, which
@@ -187,19 +190,31 @@ class CompiledUpdate:
         except RuntimeError as error:
             if "data-dependent" not in str(error):
                 raise
-            raise ValueError(
-                "compile needs a loss whose operations do not depend on the numbers in a batch, "
-                f"got a {type(loss).__name__} where they do: {error}"
-            ) from error
+            self._warn(
+                f"updates are not compiled: operations of the {type(loss).__name__} depend on the "
+                f"numbers in a batch ({error})"
+            )
+            return None
         finally:
             # The steps were taken, and layers with running statistics have counted the batch.
             with torch.no_grad():
                 for value, kept in zip(tensors, before, strict=True):
                     value.copy_(kept)
             learner.clear_gradients()
+        if stepped is None:
+            self._warn(
+                f"steps of the {type(optimizer).__name__} are not compiled: a program takes those "
+                "of an Adam without hooks, if all parameters of a group have gradients"
+            )
         taken = _take_state(graph_module, tensors)
         call = self._compiled(graph_module.graph, [*entries.values(), *taken])
         return Program(call, taken, stepped, moved, list(written), list(log))
+
+    def _warn(self, text: str) -> None:
+        """Say once that something falls back to PyTorch's own operations."""
+        if not self._warned:
+            self._warned = True
+            warnings.warn(text, UserWarning, stacklevel=2)
 
     def _compiled(self, graph: fx.Graph, inputs: list[Any]) -> Call:
         """Compile a graph, or return the program of an equal graph with equal inputs."""
@@ -231,30 +246,9 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
         functional = torch.func.functionalize(lambda *values: module(*values))
         with mode:
             graph = make_fx(functional, decomposition_table=select_decomp_table())(*fakes)
-        _narrow_products(graph)
         compiled: Any = compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
     call = compiled.current_callable
     return lambda *values: call([*values])
-
-
-def _narrow_products(module: fx.GraphModule) -> None:
-    """Compute of a matrix product only the columns that are used, as of the slope of Q."""
-    graph, aten = module.graph, torch.ops.aten
-    graph.eliminate_dead_code()
-    for node in graph.find_nodes(op="call_function", target=aten.slice.Tensor):
-        product, *columns = node.args
-        if product.target is not aten.mm.default or len(product.users) > 1 or columns[0] != 1:
-            continue
-        left, right = product.args
-        with graph.inserting_before(node):
-            part = graph.call_function(aten.slice.Tensor, (right, *columns))
-            narrow = graph.call_function(aten.mm.default, (left, part))
-        part.meta["val"] = aten.slice.Tensor(right.meta["val"], *columns)
-        narrow.meta["val"] = aten.mm.default(left.meta["val"], part.meta["val"])
-        node.replace_all_uses_with(narrow)
-        graph.erase_node(node)
-        graph.erase_node(product)
-    module.recompile()
 
 
 def _keep_programs() -> None:
@@ -279,6 +273,15 @@ def _keep_programs() -> None:
             f"{folder} must be a folder of your own: set XDG_CACHE_HOME or TORCHINDUCTOR_CACHE_DIR"
         ) from error
     os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder)
+
+
+def _leaves(batch: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[NestedKey, Tensor]]:
+    """Iterate over the tensors of a batch, in half of the time of its own iterator."""
+    for key, value in batch.items():
+        if isinstance(value, Tensor):
+            yield (*path, key) if path else key, value
+        elif is_tensor_collection(value) and not is_non_tensor(value):
+            yield from _leaves(value, (*path, key))
 
 
 def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
