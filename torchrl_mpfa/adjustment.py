@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -122,16 +122,16 @@ def decay_threshold(priority: Tensor) -> Tensor:
     r"""Priority below which nothing decays, the batch mean :math:`p_{th}` (Eq. 24).
 
     Args:
-        priority: Priorities of the whole batch, shape ``[B]``.
+        priority: Priorities of the whole batch, shape ``[B]``; ``[U, B]`` for several batches.
 
     Returns:
-        Their mean, shape ``[]``.
+        The mean of each batch, shape ``[]`` or ``[U]``.
 
     Examples:
         >>> float(decay_threshold(torch.tensor([1.0, 3.0])))
         2.0
     """
-    return priority.mean()
+    return priority.mean(-1)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,11 @@ class BatchFacts:
 
 @runtime_checkable
 class Adjustment(Protocol):
-    """A change of the priorities of a batch; any callable of this form will do."""
+    """A change of the priorities of a batch; any callable of this form will do.
+
+    If it has an attribute ``takes_batches`` that is true, it may be given several batches at once:
+    then each ``[B]`` is ``[U, B]``.
+    """
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
@@ -222,6 +226,7 @@ class PositiveBoost:
     bound: Bound = "floor"
     positive_above: Level = 0.0
     target_share: float = 0.0
+    takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check(POSITIVE, boost=self.boost)
@@ -280,6 +285,7 @@ class PositiveDecay:
     sharpness: float = 0.01
     position: Position = "batch"
     positive_above: Level = 0.0
+    takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check(POSITIVE, sharpness=self.sharpness)
@@ -292,18 +298,18 @@ class PositiveDecay:
         if self.position == "count":
             return decay_factor(batch.replay_count, sharpness=self.sharpness)
         by_place = _factors_by_place(
-            priority.numel(), self.sharpness, priority.dtype, priority.device
+            priority.shape[-1], self.sharpness, priority.dtype, priority.device
         )
         if self.position == "batch":
             return by_place
-        order = priority.argsort(descending=True, stable=True)
-        return torch.empty_like(by_place).index_copy_(0, order, by_place)
+        order = priority.argsort(dim=-1, descending=True, stable=True)
+        return torch.empty_like(priority).scatter_(-1, order, by_place.expand_as(priority))
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Decay the positive transitions above the threshold, shape ``[B]``."""
         mean = decay_threshold(priority)
         # A number is faster on the CPU; a GPU would be waited for.
-        threshold = mean.item() if mean.is_cpu else mean
+        threshold = mean.item() if mean.is_cpu and mean.ndim == 0 else mean.unsqueeze(-1)
         decayed = priority * self.factors(priority, batch)
         positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
         # The mean of equal numbers may be rounded to below them.

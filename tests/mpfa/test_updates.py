@@ -15,12 +15,15 @@ from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
     ActorCriticLearner,
     MPFASampler,
+    PositiveBoost,
+    PositiveDecay,
     SignalTensorStorage,
     make_actor,
     make_critic,
     make_ddpg_loss,
     run_updates,
 )
+from torchrl_mpfa.learners.adam import FlatAdam
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
 from torchrl_mpfa.selection import SampledBatch, one_batch
 
@@ -121,6 +124,42 @@ def test_one_call_samples_and_one_writes(monkeypatch):
         monkeypatch.setattr(MPFASampler, name, spy)
     run_updates(make_buffer(), make_learner(), updates=UPDATES)
     assert calls == ["sample", "update_signals"]
+
+
+class OneBatch(PositiveBoost):
+    """A boost whose own method takes a batch, ``[B]``."""
+
+    def __call__(self, priority, batch):
+        assert priority.shape == batch.reward.shape == batch.written_at.shape == (BATCH,)
+        return super().__call__(priority, batch)
+
+
+def test_an_own_adjustment_of_one_batch_gets_them_one_by_one_and_the_same_numbers():
+    found = []
+    for boost in (PositiveBoost, OneBatch):
+        buffer = make_buffer(adjustments=(boost(), PositiveDecay(position="rank")))
+        run_updates(buffer, make_learner(), updates=UPDATES)
+        found.append(buffer.sampler.priorities())
+    assert same(*found)
+
+
+def test_a_round_follows_a_change_of_the_loss_and_looks_for_it_once(monkeypatch):
+    looks, found = [], []
+    holds = FlatAdam.holds
+    monkeypatch.setattr(FlatAdam, "holds", lambda self: looks.append(1) or holds(self))
+    for changed in (False, True):
+        torch.manual_seed(0)
+        loss = make_ddpg_loss(
+            *(make(OBSERVATION, ACTION, width=8) for make in (make_actor, make_critic))
+        )
+        learner, buffer = ActorCriticLearner(loss, compile={"disable": True}), make_buffer()
+        run_updates(buffer, learner, updates=UPDATES)
+        looks.clear()
+        loss.saturation_penalty = 5.0 * changed
+        loss.saturation_limit = 0.0
+        found.append(run_updates(buffer, learner, updates=UPDATES)[0]["loss_actor"])
+        assert len(looks) == 1
+    assert not same(*found)
 
 
 @pytest.mark.parametrize("position", ["batch", "rank", "count"])

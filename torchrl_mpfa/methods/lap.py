@@ -8,6 +8,7 @@ experience replay", https://arxiv.org/abs/2007.06049. Its uniform twin PAL is a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -34,6 +35,7 @@ class LAPFloor:
     """
 
     floor: float = 1.0
+    takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check(POSITIVE, floor=self.floor)

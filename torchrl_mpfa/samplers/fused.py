@@ -224,15 +224,18 @@ class SignalSampler(TreeSampler):
         stale = 0 if live is None else len(live) - len(slots)
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
         table.fill_learned(rows, signals, self._learned, live, sizes)
-        parts = by_batch(sizes, slots, rows)
         table.check_fused(rows, self._names, self._columns)
         if slots.numel() == 0:
             return stale
-        weighing, adjusted = self._weighing, []
-        for one, of_one in parts:
+        weighing, adjusted, at_once = self._weighing, [], 1
+        if stale == 0 and self._takes_batches():
+            sizes, at_once = [len(slots)], batches
+        for one, of_one in by_batch(sizes, slots, rows):
             if len(one):
-                weighing = self._weigh(table, one, weighing)  # Eqs. (15)-(20).
-                adjusted.append(self._fused(table, of_one, one, weighing))  # Eqs. (21)-(24).
+                first = one[: len(one) // at_once]
+                weighing = self._weigh(table, first, weighing)  # Eqs. (15)-(20).
+                # Eqs. (21)-(24).
+                adjusted.append(self._fused(table, of_one, one, weighing, at_once))
         priority = adjusted[0] if len(adjusted) == 1 else torch.cat(adjusted)
         if (last := last_of_each(slots)) is not None:
             slots, rows, priority = (each.index_select(0, last) for each in (slots, rows, priority))
@@ -244,15 +247,28 @@ class SignalSampler(TreeSampler):
         self._set(slots, priority, highest)  # Eq. (8).
         return stale
 
-    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
-        """Return priorities by Eqs. (21)-(24), eps included, shape ``[B]``."""
-        priority = self._combined(rows, weighing)
+    def _takes_batches(self) -> bool:
+        """Return True if equal batches can be fused and adjusted in one call."""
+        # Nothing may be counted again between two batches.
+        counts = any(self._counting) or getattr(self.fusion, "every_batch", False)
+        if counts or self.entropy_refresh == 0:
+            return False
+        # Said by the class itself: a subclass may have a method that takes one batch.
+        said = [vars(type(each)).get("takes_batches", False) for each in self.adjustments]
+        return all(said)
+
+    def _fused(
+        self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing, batches: int
+    ) -> Tensor:
+        """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
+        shape = (batches, -1) if batches > 1 else slots.shape
+        priority = self._combined(rows, weighing).view(shape)
         facts = BatchFacts(
-            reward=rows.select(1, table.reward_column),
-            replay_count=rows.select(1, table.count_column),
-            index=slots,
+            reward=rows.select(1, table.reward_column).view(shape),
+            replay_count=rows.select(1, table.count_column).view(shape),
+            index=(slots := slots.view(shape)),
             mean_reward=weighing.mean_reward,
-            written_at=rows.select(1, table.time_column),
+            written_at=rows.select(1, table.time_column).view(shape),
         )
         for place, adjust in enumerate(self.adjustments):
             own = replace(facts, counted=weighing.counted[place]) if weighing.counted else facts
@@ -261,7 +277,7 @@ class SignalSampler(TreeSampler):
             raise ValueError(
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
             )
-        return priority.to(torch.double)
+        return priority.to(torch.double).reshape(-1)
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""
