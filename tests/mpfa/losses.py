@@ -1,5 +1,6 @@
 """Small networks, batches and losses that the tests of loss and learner share."""
 
+import warnings
 from copy import deepcopy
 
 import torch
@@ -140,4 +141,6 @@ def differentiate_at_once(loss, batch, *, trains="both", loss_function=None):
     # A program takes no steps of RAdam, but gives the gradients.
     learner = ActorCriticLearner(loss, optimizer="radam")
     loss.load_state_dict(state)  # A learner sets the targets to the networks.
-    return CompiledUpdate(learner, {"disable": True})(batch, trains, loss_function)[0]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="steps of the RAdam are not compiled")
+        return CompiledUpdate(learner, {"disable": True})(batch, trains, loss_function)[0]

@@ -75,7 +75,7 @@ def test_the_cure_gives_every_signal_its_weight(level):
     ],
 )
 def test_mean_as_level_causes_a_warning_of_equal_weights(make):
-    with pytest.warns(UserWarning, match="equal weights, whatever the data") as told:
+    with pytest.warns(UserWarning, match="equal weights for any data") as told:
         make()
     assert len(told) == 1
 
