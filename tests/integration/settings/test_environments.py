@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -136,19 +137,20 @@ def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> N
     ],
 )
 def test_the_ids_are_the_tasks_that_the_regimes_learn(
-    env_id: str, world: str, changed: dict[str, object]
+    env_id: str, world: str, changed: dict[str, Any]
 ) -> None:
-    trained = vector_of(make_training_env(world, EnvironmentSettings(**changed), robots=2))  # type: ignore[arg-type]
+    trained = vector_of(make_training_env(world, EnvironmentSettings(**changed), robots=2))
     made = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
     for env in (trained, made):
         env.reset(seed=1)
     assert made.tasks == trained.tasks
     assert made.worlds == trained.worlds
     mine, theirs = (env.state_dict()["arguments"] for env in (made, trained))
-    # When robots are reset is decided by whoever steps them. The regime scales the closeness of a
-    # robot that can stop by its radius alone.
+    # When robots are reset is decided by whoever steps them.
     for arguments in (mine, theirs):
-        del arguments["autoreset_mode"], arguments["closeness_distance"]
+        del arguments["autoreset_mode"]
+    # The regime scales the closeness of a robot that can stop by its radius alone.
+    theirs["closeness_distance"] += changed.get("clearance", 0.0)
     assert mine == pytest.approx(theirs)
     assert made._source._max_goal_distance == trained._source._max_goal_distance
     trained.close()
