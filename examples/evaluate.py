@@ -5,11 +5,12 @@
     python examples/evaluate.py runs/demo --worlds all        all test worlds without walkers
     python examples/evaluate.py td3-rooms                 a policy that comes with the package
     python examples/evaluate.py --policy dwa --worlds bars:validation    a planner
+    python examples/evaluate.py td3-rooms --robot turtlebot4    on another robot than its own
     python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, not kept
 
 Prints one row per world or generator, and the total. Writes to --output; by default to
 ``evaluation-WORLDS-PHYSICS`` in the folder of the run, or, for other files and planners, in
-runs/evaluation-NAME; another seed and noise are part of that name:
+runs/evaluation-NAME; another seed, robot and noise are part of that name:
 summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (one row
 per episode), settings.json (the arguments, and a policy's card), trajectories.png (paths in up to
 nine worlds, at most twenty in each), episode.gif (the longest one from above, with the speeds of
@@ -45,7 +46,6 @@ from mpfa_envs import (
 )
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.files import policy_file
-from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE
 from torchrl_mpfa.saving import write_text_atomically
@@ -53,10 +53,12 @@ from training import files
 from training.environments import check_physics
 from training.evaluating import (
     Drivable,
+    add_robot,
     drive,
     evaluation_folder,
     filtered,
     needs_filter,
+    on_robot,
     summary_row,
     tasks_of,
 )
@@ -109,10 +111,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--memory", choices=["none", "map"], default="none", help="map: dwa has a map of its own"
     )
-    parser.add_argument(
-        "--robot",
-        help=f"what a planner drives, {', '.join(ROBOTS)} or a YAML file (default: turtlebot2)",
-    )
+    add_robot(parser, "that of the policy; turtlebot2 for planners")
     parser.add_argument(
         "--worlds",
         nargs="+",
@@ -156,8 +155,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":
         parser.error(f"--memory {options.memory} is for --policy dwa alone")
-    if options.robot is not None and options.policy is None:
-        parser.error(f"--robot {options.robot} is for planners: a policy has its own")
     try:
         options.robot = options.robot and resolve_robot(options.robot)
         options.names = parse_worlds(options.worlds)
@@ -188,16 +185,15 @@ def read_noise(words: str) -> RobotNoise:
 def load_driver(options: argparse.Namespace) -> Drivable:
     """The policy or the planner that the command line names."""
     if options.policy is None:
-        return load_policy(options.path)
+        return on_robot(load_policy(options.path), options.robot)
     robot = options.robot or "turtlebot2"
     return make_planner(options.policy, robot=robot, memory=options.memory, seed=options.seed)
 
 
 def name_of(options: argparse.Namespace) -> str:
     """Return the name of what is evaluated: the path of a policy, or a planner's name."""
-    if options.policy is None:
-        return str(options.path)
-    parts = [options.policy, options.memory if options.memory != "none" else ""]
+    parts = [options.policy or str(options.path)]
+    parts.append(options.memory if options.memory != "none" else "")
     parts.append(options.robot.name if options.robot else "")
     return "-".join(part for part in parts if part)
 
@@ -210,6 +206,7 @@ def output_folder(options: argparse.Namespace) -> Path:
         seed=options.seed,
         noise=options.noise,
         filtered=options.filter,
+        robot=options.robot if options.policy is None else None,
     )
     policy = options.path
     if policy is None:
@@ -355,8 +352,8 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
         else:
             document |= {"policy": options.policy, "memory": options.memory}
-            if options.robot is not None:
-                document["robot"] = asdict(options.robot)
+        if options.robot is not None:
+            document["robot"] = asdict(options.robot)
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")

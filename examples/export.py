@@ -3,6 +3,7 @@
     python examples/export.py runs/demo                             writes runs/demo/policy.onnx
     python examples/export.py td3-rooms                 a policy that comes with the package
     python examples/export.py runs/demo --quantize --output small.onnx    eight-bit weights
+    python examples/export.py td3-rooms --robot cart.yaml    for another robot than it learned on
 
 The card, ``policy.json``, says what the policy senses and in which units, what its robot may do,
 how it was trained, how well it performs (the evaluations in the run's folder) and which file it
@@ -16,6 +17,7 @@ import argparse
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,10 @@ import numpy as np
 
 from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy
 from mpfa_envs.policies.files import policy_file
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.resolve import resolve_robot
 from training import files
-from training.evaluating import as_trained, needs_filter
+from training.evaluating import add_robot, as_trained, needs_filter, on_robot
 
 TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""
@@ -43,6 +47,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--output", type=Path, help="the file (default: NAME.onnx next to it)")
     parser.add_argument("--quantize", action="store_true", help="round weights to eight bits")
+    add_robot(parser, "that of the policy")
     parser.add_argument("--world", default="test", help="where both drive (default: test)")
     parser.add_argument(
         "--episodes", type=int, default=100, help="tasks that both drive; 0: none (default: 100)"
@@ -51,7 +56,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if options.episodes < 0:
         parser.error(f"--episodes must be at least 0, got {options.episodes}")
     try:
-        options.policy = load_policy(options.path)
+        options.robot = options.robot and resolve_robot(options.robot)
+        options.policy = on_robot(load_policy(options.path), options.robot)
     except (ValueError, OSError) as error:
         parser.error(str(error))
     options.source = policy_file(options.path)
@@ -71,14 +77,15 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def known_results(source: Path) -> list[dict[str, Any]]:
-    """The evaluations in the folder of a policy that are of this very file."""
+def known_results(source: Path, robot: RobotModel | None) -> list[dict[str, Any]]:
+    """The evaluations in the folder of a policy that are of this very file on this robot."""
+    fields = None if robot is None else json.loads(json.dumps(asdict(robot)))
     found = []
     for file in sorted(source.parent.glob("evaluation*/evaluation.json")):
         settings = file.parent / files.SETTINGS
         if settings.is_file():
             asked = json.loads(settings.read_text(encoding="utf-8"))
-            if asked.get("sha256") == files.digest(source):
+            if (asked.get("sha256"), asked.get("robot")) == (files.digest(source), fields):
                 numbers = json.loads(file.read_text(encoding="utf-8"))
                 how = {"physics": asked["physics"], "filter": "filter" in asked}
                 found.append({"worlds_asked": asked["words"], **how, **numbers})
@@ -115,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     """
     options = parse(arguments)
     policy: Policy = options.policy
-    results = known_results(options.source)
+    results = known_results(options.source, options.robot)
     # Next to its place at first: a file that differs from its policy must not lie there.
     trial = options.output.with_name(f".{os.getpid()}.{options.output.name}")
     try:

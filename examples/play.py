@@ -3,6 +3,7 @@
     python examples/play.py                                td3-rooms, which comes with the package
     python examples/play.py runs/demo --worlds mazes:test
     python examples/play.py --worlds D --speed 2           twice as fast as real time
+    python examples/play.py --robot turtlebot4             both drive another robot
 
 Drive with the arrow keys or WASD: up is full speed ahead, left and right turn, both together make
 a curve. Without a key the robot stands, and down reverses; the paper's robot, which can do neither,
@@ -33,7 +34,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
-from training.evaluating import tasks_of
+from training.evaluating import add_robot, on_robot, tasks_of
 from training.worlds import parse_worlds
 
 POLICY = "td3-rooms"
@@ -146,12 +147,13 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         default=["rooms:test"],
         help="as in evaluate.py (default: rooms:test)",
     )
+    add_robot(parser, "that of the policy")
     parser.add_argument("--races", type=int, default=10, help="at most (default: 10)")
     parser.add_argument("--seed", type=int, default=0, help="seed of starts and goals (default: 0)")
     parser.add_argument("--speed", type=float, default=1.0, help="times real time (default: 1)")
     options = parser.parse_args(arguments)
     try:
-        policy = load_policy(options.path)
+        policy = on_robot(load_policy(options.path), options.robot)
         names = parse_worlds(options.worlds)
         tasks = tasks_of(policy, names, episodes=options.races, seed=options.seed)
         step = policy.env_arguments.get("action_repeat", 2) * 0.1

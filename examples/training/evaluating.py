@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, dataclass
 from itertools import accumulate
 from typing import Any
@@ -21,6 +23,8 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
 from mpfa_envs.planners import DynamicWindow, MapPlanner
 from mpfa_envs.robots.drives import SERVERS
+from mpfa_envs.robots.model import ROBOTS, RobotModel
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from training.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow | Filtered
@@ -48,6 +52,7 @@ def evaluation_folder(
     seed: int = 0,
     noise: RobotNoise | None = None,
     filtered: bool = False,
+    robot: RobotModel | None = None,
 ) -> str:
     """Name of the folder of an evaluation: each choice has its own.
 
@@ -60,10 +65,40 @@ def evaluation_folder(
         [
             f"evaluation-{worlds_label(words)}-{physics}",
             "-filter" if filtered else "",
+            f"-{robot.name}" if robot is not None else "",
             f"-seed{seed}" if seed else "",
             *(f"-{what}{value:g}" for what, value in errors.items() if value),
         ]
     )
+
+
+def add_robot(parser: ArgumentParser, whose: str) -> None:
+    """Add the option ``--robot``; ``whose`` says which robot is the default."""
+    parser.add_argument("--robot", help=f"{', '.join(ROBOTS)} or a YAML file (default: {whose})")
+
+
+def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
+    """Put a policy on another robot than it was trained on; None: leave it where it is.
+
+    Raises:
+        ValueError: If there is no such robot, or it senses another number of values.
+    """
+    if robot is None:
+        return policy
+    robot, known = resolve_robot(robot), TaskConfig(**policy.env_arguments)
+    moved = copy(policy)
+    # The lidar saturates as far from the rim as it did.
+    near = known.closeness_distance - known.robot.radius + robot.radius
+    changes = {"robot": asdict(robot), "closeness_distance": round(near, 9)}
+    moved.env_arguments = {**policy.env_arguments, **changes}
+    parts = TaskConfig(**moved.env_arguments).observation_slices
+    senses = max(part.stop for part in parts.values())
+    if senses != policy.observation_size:
+        raise ValueError(
+            f"--robot must sense {policy.observation_size} values as {known.robot.name!r} does, "
+            f"got {senses} of {robot.name!r}: train a policy with environment.robot"
+        )
+    return moved
 
 
 def filtered(policy: Policy | MapPlanner | DynamicWindow, **env_arguments: Any) -> Filtered:

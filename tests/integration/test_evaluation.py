@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ from mpfa_envs import GENERATORS, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.render import film_episode
+from mpfa_envs.robots.model import ROBOTS
 from training import files
 from training.comparison.jobs import Evaluation, Job
-from training.evaluating import drive, summary_row
+from training.evaluating import drive, on_robot, summary_row
 from training.records import read_table
 from training.run.assembly import make_learner
 from training.run.evaluations import exported_policy
@@ -123,6 +124,42 @@ def test_several_worlds_have_a_row_each_and_a_total(
     assert "rooms-6" in capsys.readouterr().out
 
 
+def test_a_policy_drives_another_robot_and_its_results_stay_apart(run: Path) -> None:
+    how = [str(run), "--worlds", "B", "--episodes", "3", "--no-pictures"]
+    slow = replace(ROBOTS["turtlebot2"], name="cart", max_wheel_speed=0.3)
+    cart = run / "cart.yaml"
+    cart.write_text(json.dumps({k: v for k, v in asdict(slow).items() if v is not None}))
+    evaluate.main(how)
+    evaluate.main([*how, "--robot", str(cart)])
+    alone, moved = (
+        read_table(run / f"evaluation-B-kinematic{robot}" / "episodes.csv")["path_length"]
+        for robot in ("", "-cart")
+    )
+    assert (moved < 0.8 * alone).all()
+    said = json.loads((run / "evaluation-B-kinematic-cart" / "settings.json").read_text())
+    assert said["robot"]["max_wheel_speed"] == 0.3
+
+
+def test_a_policy_moved_to_another_robot_keeps_its_distance_from_the_rim() -> None:
+    policy, wide = load_policy("td3-rooms"), replace(ROBOTS["kobuki"], name="wide", radius=0.3)
+    moved = on_robot(policy, wide)
+    assert moved.env_arguments["robot"]["name"] == "wide"
+    assert moved.env_arguments["closeness_distance"] == pytest.approx(0.3)
+    assert policy.env_arguments["robot"]["name"] == "kobuki"
+    assert on_robot(policy, None) is policy
+
+
+def test_a_robot_that_senses_another_number_of_values_is_rejected(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        evaluate.main(["td3-rooms", "--robot", "turtlebot2"])
+    assert (
+        "--robot must sense 45 values as 'kobuki' does, got 27 of 'turtlebot2'"
+        in capsys.readouterr().err
+    )
+
+
 def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Path) -> None:
     asked = Evaluation(("A",), 1, "kinematic")
     job = Job("ddpg", "per", 0, run.parent)
@@ -131,14 +168,15 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
     (job.path / files.STATUS).write_text('{"finished": true}')
     how = [str(job.path), "--worlds", "A", "--episodes", "1", "--no-pictures"]
     study = ["--output", str(job.results(asked))]
-    others = (["--seed", "3"], ["--noise", "slip=0.1,latency=1"])
+    others = (["--seed", "3"], ["--noise", "slip=0.1,latency=1"], ["--robot", "turtlebot2"])
     evaluate.main(how)
     assert job.is_evaluated(asked)
     for other in others:
         evaluate.main([*how, *other])
         assert job.is_evaluated(asked)
     names = {path.name.removeprefix("evaluation-A-") for path in job.path.glob("evaluation-*")}
-    assert names == {"kinematic", "kinematic-seed3", "kinematic-slip0.1-latency1"}
+    changed = {"seed3", "slip0.1-latency1", "turtlebot2"}
+    assert names == {"kinematic", *(f"kinematic-{each}" for each in changed)}
     for other in others:
         evaluate.main([*how, *other, *study])
         assert not job.is_evaluated(asked)

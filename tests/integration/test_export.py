@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ import evaluate
 import export
 from mpfa_envs import load_policy
 from mpfa_envs.policies.files import policy_file
+from mpfa_envs.robots.model import ROBOTS
 
 SHIPPED = "td3-paper"
 
@@ -47,6 +49,20 @@ def test_a_policy_that_needs_the_filter_is_driven_behind_it(tmp_path: Path) -> N
     compared = json.loads(file.with_suffix(".json").read_text())["results"][-1]
     assert compared["filter"] and compared["same"] == 10
     assert compared["exported"]["success"] == 1.0
+
+
+def test_a_file_for_another_robot_has_its_numbers_and_results_on_the_card(tmp_path: Path) -> None:
+    shutil.copy(policy_file("td3-rooms"), tmp_path / "policy.npz")
+    how, robot = ["--worlds", "B", "--episodes", "2", "--no-pictures"], ["--robot", "turtlebot4"]
+    for other in ([], robot):
+        evaluate.main([str(tmp_path), *how, *other])
+    export.main([str(tmp_path), "--episodes", "0", *robot])
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert card["robot"] == asdict(ROBOTS["turtlebot4"]) | {"lidar_mount": [0.0, 0.0, 0.0]}
+    assert card["limits"]["linear_speed"] == [-0.306, 0.306]
+    [known] = card["results"]
+    [of_robot] = tmp_path.glob("evaluation-*-turtlebot4")
+    assert known["time_s"] == json.loads((of_robot / "evaluation.json").read_text())["time_s"]
 
 
 def test_a_file_that_differs_is_not_written(

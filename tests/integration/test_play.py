@@ -105,6 +105,16 @@ def test_without_a_key_a_robot_that_can_stop_stands() -> None:
     assert racer.pose == start
 
 
+@pytest.mark.parametrize(("words", "name"), [([], "kobuki"), (["--robot", "waffle"], "waffle")])
+def test_both_drive_the_robot_of_the_policy_or_another(
+    words: list[str], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven: list[Any] = []
+    monkeypatch.setattr(play, "race", lambda policy, *_, **how: driven.append(policy))
+    play.main(["td3-rooms", "--worlds", "A", "--races", "1", *words])
+    assert [policy.env_arguments["robot"]["name"] for policy in driven] == [name]
+
+
 def test_a_player_may_leave(capsys: pytest.CaptureFixture[str]) -> None:
     pygame.display.init()
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE))

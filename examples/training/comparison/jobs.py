@@ -151,9 +151,10 @@ class Job:
             and found.get("words") == list(wanted.words)
             and found.get("physics") == self.physics(wanted)
             and ("filter" in found) == self.filtered(wanted)
-            # A comparison drives the pairs of the first seed, and robots without errors.
+            # A comparison drives the pairs of the first seed, and its robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None
+            and found.get("robot") is None
             and policy.exists()
             and found.get("sha256") == files.digest(policy)
         )
