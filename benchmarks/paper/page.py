@@ -44,12 +44,25 @@ The paper's worlds are not published. Ours follow its pictures and its text. So 
 within a column, not our column with the paper's.
 """
 _CHANGED = """
-**Changed after the start.** Nothing since rows were seen, which were those of the seeds 100 to 104.
-[Two changes](#how-to-read-the-tables) were made before.
+**Changed after the start.** Nothing. Rows were first looked at when the seeds 100 to 104 were made.
+[Two changes](#how-to-read-the-tables) are older.
+"""
+_STEPS = """
+A step is an action of 0.2 s. Times are those of runs that had the machine to themselves, one after
+another.
+"""
+_PHI = """
+The factor φ of the raise, as in Fig. 5. These runs train for 100 episodes in world A, which has no
+obstacles. So most of their tests in the unseen world end in collisions.
+"""
+_ROBOTS = """
+One robot with one update per action beside sixteen robots with sixteen updates. An arm without a
+row has no runs yet.
 """
 _LETTER = """
 To the letter of the paper (`learner=plain`): without the additions that keep DDPG from collapsing,
-with collisions at 0.35 m from the robot's center, and without mirrored batches.
+with collisions at 0.35 m from the robot's center, without mirrored batches, and with noise of one
+size.
 """
 _READ = (
     """
@@ -61,13 +74,13 @@ that reached their goal.
 """,
     """
 Arms with at least six seeds in common are compared seed by seed, and p is that of the permutation
-test of signs. Other arms are compared by the means of all their runs. *Found with 80 % power* is
-the true difference that a t-test of as many seeds finds with that probability. Its level is 5 %
-divided by the number of comparisons.
+test of signs. Other arms are compared by the means of all their runs, without a power. *Found with
+80 % power* is the true difference that a t-test of as many seeds finds with that probability. Its
+level is 5 % divided by the number of comparisons.
 """,
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
-changed before all runs were made. The intervals are Student's in place of a bootstrap's, so that
+changed before any row was looked at. The intervals are Student's in place of a bootstrap's, so that
 other programs compute the same numbers. The arm to the letter has five seeds in place of ten.
 """,
 )
@@ -130,7 +143,7 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             unseen_table(found, TABLE_2),
             "## Table 3: steps and time of the training",
             trained_table(rows),
-            "Times are those of runs that had the machine to themselves, one after another.",
+            _filled(_STEPS if len(rows.times) else f"{_STEPS} No run is timed yet."),
             "## Table 4: other methods in the unseen world",
             unseen_table(found, TABLE_4),
             "## Neighbors in the paper's order: the planned comparisons",
@@ -140,11 +153,11 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             "## Uniform replay, and other settings",
             "Uniform replay, which the paper's tables do not have:",
             arms_table(found, {NAMES["uniform"]: "ddpg-uniform"}),
-            "The factor φ of the raise, trained in world A alone:",
+            _filled(_PHI),
             arms_table(found, OTHER_ARMS["φ"]),
             _filled(_LETTER),
             arms_table(found, OTHER_ARMS["letter"]),
-            "One robot with one update per action, and sixteen robots with sixteen updates:",
+            _filled(_ROBOTS),
             arms_table(found, OTHER_ARMS["robots"]),
             "## Figures",
             *pictured,

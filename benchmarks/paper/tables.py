@@ -200,7 +200,8 @@ def _count(runs: pd.DataFrame | None) -> str:
 
 
 def _points(value: float) -> str:
-    return f"{100 * value:+.1f}"
+    # Without the sign of a zero.
+    return f"{100 * value:+.1f}".replace("-0.0", "+0.0")
 
 
 def _name(arm: str) -> str:

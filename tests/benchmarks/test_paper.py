@@ -169,7 +169,7 @@ def test_answers_say_which_differences_the_runs_exclude(
     text = str(made)
     for sentence in sentences:
         assert sentence in text
-    assert "('methods of Table 3 that take more training steps', '5 of 5', '0 of 5')" in text
+    assert "with more training steps than MPFA-PER, in the mean', '5 of 5', '0 of 5')" in text
     assert "The paper's order of the methods is not confirmed." in text
 
 
