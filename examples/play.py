@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         policy = on_robot(load_policy(options.path), options.robot)
         names = parse_worlds(options.worlds)
         tasks = tasks_of(policy, names, episodes=options.races, seed=options.seed)
-        step = policy.env_arguments.get("action_repeat", 2) * 0.1
+        step = TaskConfig(**policy.env_arguments).action_time
         window = Window("arrows or WASD: drive   N: next room   Esc: end", fps=options.speed / step)
     except (ValueError, OSError, DependencyNotInstalled) as error:
         parser.error(str(error))

@@ -20,12 +20,15 @@ from mpfa_envs import (
     navigation_reward,
 )
 from mpfa_envs.env.config import lidar_arguments
+from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.tasks.reward import RewardFunction
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
 
+_DISTANCE = 0.14
+"""Farthest that a robot drives in an action [m], unless it is faster than that in 0.2 s."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
@@ -48,7 +51,9 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "robot": robot,
         "physics": settings.physics,
         "max_steps": settings.max_steps,
-        "action_repeat": settings.action_repeat,
+        "action_repeat": _repeat(robot)
+        if settings.action_repeat is None
+        else settings.action_repeat,
         "memory": settings.memory,
         "history": settings.history,
         **seen,
@@ -56,6 +61,11 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         # robot that can stop may drive on from there, and must know how near it is.
         "closeness_distance": robot.radius + (0.0 if robot.can_stop else settings.clearance),
     }
+
+
+def _repeat(robot: RobotModel) -> int:
+    """Time steps in which a robot drives as far as an action of the Kobuki, at least two."""
+    return max(2, int(_DISTANCE / (TaskConfig.time_step * robot.max_wheel_speed) + 1e-9))
 
 
 def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:

@@ -37,9 +37,10 @@ class EnvironmentSettings:
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500
     """Time limit of an episode [0.1 s]."""
-    action_repeat: int = 2
+    action_repeat: int | None = 2
     """Time steps of 0.1 s for which an action is held. DDPG is less reliable with one
-    (``docs/tuning.md``)."""
+    (``docs/tuning.md``). Null: the time in which the robot drives 0.14 m at full speed, at least
+    0.2 s."""
     progress_scale: float = setting(5.0, NOT_NEGATIVE)
     """eps_p of Eq. 25, not given in the paper. With 15 robots circle near the goal."""
     step_cost: float = setting(0.0, NOT_NEGATIVE)

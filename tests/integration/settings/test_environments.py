@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import torch
 
 from evaluate import read_noise
 from mpfa_envs import (
+    ROBOTS,
     Mirror,
     NavigationEnv,
     RandomMirror,
@@ -88,6 +89,18 @@ def test_what_the_filter_lets_pass_is_carried_out_and_stored(
     robots.close()
     assert changed > 20
     assert (collisions > 0) == (some < 8)
+
+
+@pytest.mark.parametrize(
+    ("robot", "repeat"),
+    [("kobuki", 2), ("turtlebot2", 2), ("turtlebot4", 4), ("waffle", 5), ("burger", 6)],
+)
+def test_a_slow_robot_holds_an_action_as_far_as_a_fast_one_drives(robot: str, repeat: int) -> None:
+    chosen = EnvironmentSettings(robot=robot, action_repeat=None)
+    assert env_arguments(chosen)["action_repeat"] == repeat
+    assert env_arguments(replace(chosen, action_repeat=3))["action_repeat"] == 3
+    fast = replace(ROBOTS["kobuki"], max_wheel_speed=2.0)
+    assert env_arguments(replace(chosen, robot=fast))["action_repeat"] == 2
 
 
 def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
