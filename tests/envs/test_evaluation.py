@@ -312,14 +312,22 @@ def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
     assert sum(found.success for found in results) >= 9
 
 
-@pytest.mark.parametrize(("name", "share"), [("td3-rooms", 0.99), ("ddpg-rooms", 0.97)])
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [
+        ("td3-rooms", 0.99),
+        ("ddpg-rooms", 0.97),
+        ("td3-turtlebot4", 0.99),
+        ("td3-burger", 0.98),
+    ],
+)
 def test_a_policy_of_the_package_drives_at_full_speed_where_nothing_is_in_its_path(
     name: str, share: float
 ) -> None:
     policy = load_policy(name)
     hall = World(name="hall", size=(24.0, 8.0))
     env = NavigationEnv(world=hall, contact=True, **policy.env_arguments)
-    seen, _ = env.reset(options={"start": (-10.0, 0.0, 0.0), "goal": (10.0, 0.0)})
+    seen, _ = env.reset(options={"start": (-5.0, 0.0, 0.0), "goal": (5.0, 0.0)})
     done, speeds = False, []
     while not done:
         seen, _, done, _, info = env.step(policy(seen))
