@@ -318,6 +318,7 @@ def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
         ("td3-rooms", 0.99),
         ("ddpg-rooms", 0.97),
         ("td3-turtlebot4", 0.99),
+        ("td3-waffle", 0.98),
         ("td3-burger", 0.98),
     ],
 )
