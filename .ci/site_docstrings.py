@@ -26,6 +26,7 @@ class LinkRoles(Extension):
         if obj.docstring is not None:
             text = _TABLE.sub(_table, obj.docstring.value)
             text = _FORMULA.sub(_formula, _MATH.sub(r"$\1$", text))
+            text = re.sub(r"::$", ":", text, flags=re.MULTILINE)
             text = _UNIT.sub(r" \\[", text)
             obj.docstring.value = _ROLE.sub(lambda role: _link(role, obj), text)
 

@@ -28,6 +28,11 @@ _LIST_OF_PAGES = re.compile(r"^## What is where\n.*?(?=^## )", re.DOTALL | re.MU
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(#[^)\s]*)?(?=\))")
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 _PICTURE = re.compile(r'(<a\b[^>]*>\s*)?<img\b[^>]*?\bsrc="([^"]+)"[^>]*>')
+_ROW = re.compile(r"^\|.*", re.MULTILINE)
+_TOGETHER = re.compile(
+    r"`[^`]*`|(?<=,) (?=[-+−]?[\d,.]+%?\])|(?<=\d) (?=of \d)|(?<=\d of) (?=\d)|(?<=<) (?=\d)"
+)
+"""Spaces within an interval, "n of m" and "< p"; and code, which stays as it is."""
 _LANGUAGES = {".py": "python", ".yaml": "yaml", ".toml": "toml"}
 
 
@@ -155,8 +160,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to files outside of ``docs/`` to their pages, and add words for the search."""
+    """Turn links to files outside of ``docs/`` to their pages, and add words for the search.
+
+    The numbers of an interval stay on one line.
+    """
     page.meta["tags"] = config.extra["search_words"].get(page.file.src_uri)
+    markdown = _ROW.sub(lambda row: _TOGETHER.sub(_unbroken, row[0]), markdown)
     if page.file.generated_by is not None:
         return markdown
     uri = page.file.src_uri
@@ -178,6 +187,11 @@ def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files
         return f'<a class="picture" href="{found[2]}">{found[0]}</a>'
 
     return _PICTURE.sub(picture, _FORMULA.sub(formula, content))
+
+
+def _unbroken(found: re.Match[str]) -> str:
+    """A space that does not end a line; code as it is."""
+    return "\u00a0" if found[0] == " " else found[0]
 
 
 def _is_on_site(path: str) -> bool:

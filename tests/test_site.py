@@ -87,6 +87,13 @@ def test_no_page_is_wider_than_its_window_too_long_or_cut_on_a_desktop(
     assert [url for url in elsewhere if not url.startswith(("file:", "data:"))] == []
 
 
+def test_the_numbers_of_an_interval_stay_on_one_line_and_code_as_it_is(site: Path) -> None:
+    tables = (site / "results" / "drivers.html").read_text(encoding="utf-8")
+    paper = (site / "results" / "paper.html").read_text(encoding="utf-8")
+    assert re.search(r"\[\d[\d.]*%,\xa0[\d.]+%\]", paper) and "0\xa0of\xa011" in paper
+    assert not re.search(r"<code>[^<]*\xa0", tables + paper)
+
+
 def found_by_search(site: Path, browser: Any, words: str) -> list[str]:
     """The pages that the search finds, in its order."""
     page = browser.new_page(viewport=DESKTOP)

@@ -236,8 +236,8 @@ class TreeSampler(SavedTrees):
             batch_size: ``B``.
 
         Returns:
-            Slots ``[B]``, or a tuple of places for several dimensions; and ``{"priority_weight":
-            ...}``, shape ``[B]``.
+            Slots ``[B]``, or a tuple of places for several dimensions; and
+            ``{"priority_weight": ...}``, shape ``[B]``.
 
         Raises:
             RuntimeError: If the storage is empty.
