@@ -53,6 +53,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     With ``memory="map"`` it has shape ``[27]``:
 
     ====== ================ ==================================================== ==========
+    index  name             meaning                                              range
+    ====== ================ ==================================================== ==========
     24-25  way_direction    cosine and sine of the direction, in the robot's     [-1, 1]
                             frame, of the path to the goal on its map
     26     way_length       ``length / 10 m``, longer where it is narrow         [0, 1.5]
