@@ -101,7 +101,7 @@ def training_time(rows: Rows) -> Answer | None:
         return None
     others = [name for name in TABLE_3 if name != "mpfa_per"]
     longer = sum(steps[name] > steps["mpfa_per"] for name in others)
-    most = {0: "the most", len(others): "the fewest"}.get(longer, "neither most nor fewest")
+    most = {0: "the most", len(others): "the fewest"}.get(longer, "neither the most nor the fewest")
     said = (
         f"In the mean of its runs MPFA-PER takes {most} training steps of Table 3, and in the "
         "paper the fewest. No test compares the steps."
