@@ -1,12 +1,13 @@
-"""Docstrings as the site needs them: links, formulas and tables of Sphinx become Markdown."""
+"""Docstrings and values as the site needs them: Markdown, and defaults without their code."""
 
 from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Callable
 from typing import Any
 
-from griffe import Extension, NameResolutionError, Object
+from griffe import Attribute, Expr, ExprCall, ExprKeyword, Extension, NameResolutionError, Object
 
 # "in [-π, π] [rad]" would be a link to "rad".
 _UNIT = re.compile(r"(?<=\]) \[(?=[a-zA-Z/²]+\])")
@@ -16,6 +17,9 @@ _FORMULA = re.compile(r"^( *)\.\. math::(.*\n(?:\n|\1 +.*\n?)*)", re.MULTILINE)
 _TABLE = re.compile(
     r"^( *)(=+(?: +=+)+)\n((?:\1(?!=).*\n)+)(?:\1=[= ]+\n((?:\1(?!=).*\n)+))?\1=[= ]+$", re.M
 )
+
+_LONGEST = 60
+_CALL = re.compile(r"\w\(")
 
 
 class LinkRoles(Extension):
@@ -29,6 +33,34 @@ class LinkRoles(Extension):
             text = re.sub(r"::$", ":", text, flags=re.MULTILINE)
             text = _UNIT.sub(r" \\[", text)
             obj.docstring.value = _ROLE.sub(lambda role: _link(role, obj), text)
+
+
+class Defaults(Extension):
+    """Shows a value that says something to a reader: a default or a short constant, not code."""
+
+    def on_attribute_instance(self, *, attr: Attribute, **kwargs: Any) -> None:
+        """Replace a field by its default, before signatures are made of fields."""
+        if isinstance(field := attr.value, ExprCall) and str(field.function) in _DEFAULT:
+            attr.value = _DEFAULT[str(field.function)](field)
+
+    def on_attribute(self, *, attr: Attribute, **kwargs: Any) -> None:
+        """Leave out a value that is code."""
+        code = str(attr.value)
+        if len(code) > _LONGEST or _CALL.search(code) or code == attr.name:
+            attr.value = None
+
+
+def _default_of_field(field: ExprCall) -> str | Expr:
+    """The default of a dataclass's field, without its other options, if it has one."""
+    options = [each for each in field.arguments if isinstance(each, ExprKeyword)]
+    return next((each.value for each in options if each.name == "default"), field)
+
+
+_DEFAULT: dict[str, Callable[[ExprCall], str | Expr]] = {
+    "field": _default_of_field,
+    "within": lambda field: field.arguments[1],
+    "one_of": lambda field: field.arguments[0],
+}
 
 
 def _link(role: re.Match[str], where: Object) -> str:

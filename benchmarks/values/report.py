@@ -56,10 +56,12 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         "## Planned comparisons",
         planned_table(planned),
         "## All arms",
-        "Numbers are means over all marks, but for those of the last two columns, which are at the "
-        "end. The columns `sparse` and `dense` have the RMSE to long training in six buffers each. "
-        "Arms that were not planned are exploratory and not corrected.",
+        "Numbers are means over all marks. The columns `sparse` and `dense` have the RMSE to long "
+        "training in six buffers each. Arms that were not planned are exploratory and not "
+        "corrected.",
         arm_table(rows),
+        "By the returns, and what was sampled at the end:",
+        returns_table(rows),
         table(("left out", "why"), [[f"`{name}`", why] for name, why in LEFT_OUT.items()]),
         "## Pairs",
         "Pairs have about the same effective sample, or one thing changed. They are exploratory "
@@ -105,17 +107,13 @@ def planned_table(rows: pd.DataFrame) -> str:
 
 
 def arm_table(rows: pd.DataFrame) -> str:
-    """Return all arms by both references, the best first."""
+    """Return all arms by long training, the best first."""
     found = differences(rows, against=AGAINST)
     parts = [
         differences(rows[rows["buffer"].str.startswith(reward)], against=AGAINST)
         for reward in REWARDS
     ]
-    sampled = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
-    head = (
-        *("", "RMSE, long training", "p", *REWARDS, "rank correlation"),
-        *("RMSE, returns", "rank correlation, returns", "effective sample", "goals sampled"),
-    )
+    head = ("", "RMSE, long training", "p", *REWARDS, "rank correlation")
     cells = [
         [
             f"`{name}`",
@@ -123,15 +121,28 @@ def arm_table(rows: pd.DataFrame) -> str:
             _p(row.rmse_p),
             *(_share(_row(part, name), "rmse") for part in parts),
             _gap(row, "rank"),
+        ]
+        for name, row in found.iterrows()
+    ]
+    return table(head, cells)
+
+
+def returns_table(rows: pd.DataFrame) -> str:
+    """Return all arms by the returns, and what they sample at the end, in the same order."""
+    sampled = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
+    head = ("", "RMSE, returns", "rank correlation, returns", "effective sample", "goals sampled")
+    cells = [
+        [
+            f"`{name}`",
             _share(row, "returns_rmse"),
             _gap(row, "returns_rank"),
             f"{row.effective:.0%}",
             f"{row.goals:.1%}",
         ]
-        for name, row in found.iterrows()
+        for name, row in differences(rows, against=AGAINST).iterrows()
     ]
     own = [f"{sampled['effective'].mean():.0%}", f"{sampled['goals'].mean():.1%}"]
-    cells.append([f"`{AGAINST}`", *[""] * 7, *own])
+    cells.append([f"`{AGAINST}`", "", "", *own])
     return table(head, cells)
 
 
