@@ -7,7 +7,6 @@ a fraction of as many calls; the price is that no batch knows of the updates jus
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 
 import torch
 from tensordict import TensorDictBase
@@ -117,16 +116,30 @@ def _together(
     # TorchRL warns of a batch size that is not the buffer's, which is meant here.
     buffer._warned_batch_size_conflict = True
     sampled = buffer.sample(updates * batch_size)
-    home, learned = sampled.device, []
-    with getattr(learner, "settled", nullcontext)():
-        for part in sampled.split(batch_size):
-            batch, log = _learn(learner, SampledBatch(part), prepare)
-            learned.append(batch)
+    log, learned, last = _learn_each(buffer, learner, prepare, sampled, batch_size)
     if getattr(buffer, "takes_signals", False):
-        buffer.update_tensordict_priority(_joined(buffer, sampled, learned), batches=updates)
+        buffer.update_tensordict_priority(learned, batches=updates)
     elif isinstance(buffer.sampler, PrioritizedSampler):
-        buffer.update_tensordict_priority(_joined(buffer, sampled, learned))
-    return log, _at(learned[-1], home)
+        buffer.update_tensordict_priority(learned)
+    return log, last
+
+
+def _learn_each(
+    buffer: TensorDictReplayBuffer,
+    learner: Learner,
+    prepare: Prepare | None,
+    sampled: TensorDictBase,
+    batch_size: int,
+) -> tuple[dict[str, Tensor], TensorDictBase, TensorDictBase]:
+    """Return values for the log, the signals of all batches, and the last batch with its own."""
+    each = getattr(learner, "update_each", None)
+    if prepare is None and each is not None and (log := each(sampled, batch_size)) is not None:
+        return log, sampled, sampled[-batch_size:]
+    batches = []
+    for part in sampled.split(batch_size):
+        batch, log = _learn(learner, SampledBatch(part), prepare)
+        batches.append(batch)
+    return log, _joined(buffer, sampled, batches), _at(batch, sampled.device)
 
 
 def _learn(

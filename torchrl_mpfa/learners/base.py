@@ -20,7 +20,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
 from torchrl_mpfa.learners.adam import FlatAdam
-from torchrl_mpfa.learners.compiled import CompiledUpdate
+from torchrl_mpfa.learners.compiled import CompiledUpdate, Step
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, Trains
@@ -122,7 +122,6 @@ class OptimizedLearner:
         self._rates = [group["lr"] for group in groups]
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
         self._program: CompiledUpdate | None = None
-        self._is_settled = False
         self._flatten()
         self.updates = 0
         """Training steps taken."""
@@ -131,27 +130,23 @@ class OptimizedLearner:
         self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
     ) -> dict[str, Tensor]:
         """Step the optimizer, and the target networks with the actor; return the log."""
-        if not self._is_settled:
-            self._look()
-        try:
+        self._look()
+        with _fits(batch):
             made = None if self._program is None else self._program(batch, trains, loss_function)
             if made is None:
                 self.clear_gradients()
                 values = self._differentiate(batch, trains, loss_function)
-                made = {name: value.detach() for name, value in values.items()}, False
-        except RuntimeError as error:
-            if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
-                raise
-            found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
-            forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
-            raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
-        log, stepped = made
-        if not stepped:
-            check_losses(log, batch)
-            self.optimizer.step()
-            if trains != "critic":
-                self.targets.step()
-        return log
+                made = Step({name: value.detach() for name, value in values.items()}, False)
+        if not made.taken:
+            self._take_step(made.log, batch, trains)
+        return made.log
+
+    def _take_step(self, log: dict[str, Tensor], batch: TensorDictBase, trains: Trains) -> None:
+        """Step by the gradients, if the losses are finite."""
+        check_losses(log, batch)
+        self.optimizer.step()
+        if trains != "critic":
+            self.targets.step()
 
     def _look(self) -> None:
         """Follow changes of the loss, and parameters that lie elsewhere now."""
@@ -159,16 +154,6 @@ class OptimizedLearner:
             self._flatten()
         if self._program is not None:
             self._program.read_options()
-
-    @contextmanager
-    def settled(self) -> Iterator[None]:
-        """Look once for changes of loss and parameters, which no update inside has to follow."""
-        self._look()
-        self._is_settled = True
-        try:
-            yield
-        finally:
-            self._is_settled = False
 
     def clear_gradients(self) -> None:
         """Let no parameter have a gradient."""
@@ -336,7 +321,7 @@ class ActorCriticLearner(OptimizedLearner):
         if not isinstance(sampled, SampledBatch):
             sampled = SampledBatch(sampled)
         updates = self.updates + sampled.new_step
-        trains, due = sampled.trains, updates % self.policy_delay == 0
+        trains, due = sampled.trains, self._is_due(updates)
         if trains == "both" and not due:
             trains = "critic"
         log: dict[str, Tensor] = {}
@@ -344,6 +329,41 @@ class ActorCriticLearner(OptimizedLearner):
             log = self._step(sampled.batch, trains, sampled.loss_function)
         self.updates = updates
         return log
+
+    def update_each(self, rows: TensorDictBase, batch_size: int) -> dict[str, Tensor] | None:
+        """Make an update with each batch of rows by the compiled program, and write their signals.
+
+        Args:
+            rows: Batches of one size, one after the other, ``[U * B]``.
+            batch_size: ``B``.
+
+        Returns:
+            The log of the last update; None, before anything is done, without a program.
+
+        Raises:
+            KeyError: As :meth:`update`.
+            RuntimeError: As :meth:`update`.
+            ValueError: As :meth:`update`, of whose kind the earlier ones were made.
+        """
+        if self._program is None:
+            return None
+        self._look()
+        counts = range(self.updates + 1, self.updates + 1 + len(rows) // batch_size)
+        turns: list[Trains] = ["both" if self._is_due(each) else "critic" for each in counts]
+        with _fits(rows):
+            steps = self._program.each(rows, batch_size, turns)
+        if steps is None:
+            return None
+        for number, (made, trains) in enumerate(zip(steps, turns, strict=True)):
+            if not made.taken:
+                start = number * batch_size
+                self._take_step(made.log, rows[start : start + batch_size], trains)
+            self.updates += 1
+        return made.log
+
+    def _is_due(self, update: int) -> bool:
+        """Return True if an update of this number is one of the actor and the targets as well."""
+        return update % self.policy_delay == 0
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
@@ -371,6 +391,19 @@ def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.o
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
+
+
+@contextmanager
+def _fits(batch: TensorDictBase) -> Iterator[None]:
+    """Say of which form a batch is that does not fit the loss."""
+    try:
+        yield
+    except RuntimeError as error:
+        if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
+            raise
+        found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
+        forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
+        raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
 
 
 def check_losses(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:

@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,6 +56,15 @@ class Program(NamedTuple):
     """Names of the values for the log."""
 
 
+class Step(NamedTuple):
+    """What an update has done."""
+
+    log: dict[str, Tensor]
+    taken: bool
+    """True if the steps were taken, which they are not if a loss is not finite, or if they are left
+    to the learner."""
+
+
 class CompiledUpdate:
     """Makes the updates of a learner by a program, one for each form of a batch.
 
@@ -77,43 +87,90 @@ class CompiledUpdate:
 
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
-    ) -> tuple[dict[str, Tensor], bool] | None:
-        """Make an update like losses, backward pass and steps do.
+    ) -> Step | None:
+        """Make an update like losses, backward pass and steps do, and write signals in the batch.
 
         Returns:
-            The log; and True if the steps were taken, which they are not if a loss is not finite,
-            or if they are left to the learner. None if the update cannot be recorded.
+            None if the update cannot be recorded.
         """
-        # A program is for one layout, which a slice of another tensor has not.
-        written = self._written
-        entries = {k: v.contiguous() for k, v in _leaves(batch) if k not in written}
+        entries = self._entries(batch)
+        program = self._program_for(entries, batch.batch_size[:1], trains, loss_function)
+        if program is None:
+            return None
+        made, signals = self._run(program, entries.values())
+        for key, value in zip(program.written, signals, strict=True):
+            _write(batch, key, value)
+        return made
+
+    def each(
+        self, rows: TensorDictBase, batch_size: int, turns: Sequence[Trains]
+    ) -> Iterator[Step] | None:
+        """Make an update with each batch of rows, as so many calls, and write all signals at last.
+
+        A TensorDict is not made of each batch, which would take as long as an update by Adam.
+
+        Args:
+            rows: Batches of one size, one after the other, ``[U * B]``.
+            batch_size: ``B``.
+            turns: The networks that learn from each batch.
+
+        Returns:
+            None, before anything is done, if one of the updates cannot be recorded.
+        """
+        columns = {key: value.split(batch_size) for key, value in self._entries(rows).items()}
+        first = {key: parts[0] for key, parts in columns.items()}
+        size = torch.Size([batch_size])
+        programs = {each: self._program_for(first, size, each, None) for each in set(turns)}
+        if None in programs.values():
+            return None
+        return self._runs(rows, columns, [programs[each] for each in turns])
+
+    def _runs(
+        self, rows: TensorDictBase, columns: dict[NestedKey, Any], programs: list[Any]
+    ) -> Iterator[Step]:
+        """Run one program after the other; write all signals at last."""
+        found: dict[NestedKey, list[Tensor]] = {}
+        for program, *values in zip(programs, *columns.values(), strict=True):
+            made, signals = self._run(program, values)
+            for key, value in zip(program.written, signals, strict=True):
+                found.setdefault(key, []).append(value)
+            yield made
+        for key, parts in found.items():
+            _write(rows, key, torch.cat(parts))
+
+    def _entries(self, batch: TensorDictBase) -> Entries:
+        """Return what a program may read, each tensor in the one layout that programs are for."""
+        return {k: v.contiguous() for k, v in _leaves(batch) if k not in self._written}
+
+    def _program_for(
+        self, entries: Entries, size: torch.Size, trains: Trains, loss_function: str | None
+    ) -> Program | None:
+        """Return the program for batches of this form, made at the first of them."""
         precision = torch.is_autocast_enabled(self._device) and torch.get_autocast_dtype(
             self._device
         )
         steps = _records_steps(self._learner.optimizer)
         form = trains, loss_function, precision, steps, self._options, *map(_form, entries.items())
         if form not in self._programs:
-            made = self._make(entries, batch.batch_size[:1], trains, loss_function, steps)
-            self._programs[form] = made
-        program = self._programs[form]
-        if program is None:
-            return None
+            self._programs[form] = self._make(entries, size, trains, loss_function, steps)
+        return self._programs[form]
+
+    def _run(self, program: Program, values: Iterable[Tensor]) -> tuple[Step, list[Tensor]]:
+        """Make an update by a program; return the signals as well."""
         for group in program.stepped or ():
             group.scale()
         with torch.no_grad():
-            found = iter(program.call(*entries.values(), *program.state))
+            given = program.call(*values, *program.state)
+        found = iter(given)
         for parameter in program.moved:
             parameter.grad = next(found)
-        for key in program.written:
-            # Found to fit when the update was recorded; the checks of a batch take half of a write.
-            path = (key,) if isinstance(key, str) else key
-            batch._set_tuple(path, next(found), inplace=False, validated=True, non_blocking=False)
+        signals = list(islice(found, len(program.written)))
         log = dict(zip(program.log, found, strict=False))
         if program.stepped is None or not next(found).item():
-            return log, False
+            return Step(log, False), signals
         for group in program.stepped:
             group.count_step(self._learner.optimizer.state)
-        return log, True
+        return Step(log, True), signals
 
     def forget(self) -> None:
         """Have programs made again: the tensors of the learner lie elsewhere now."""
@@ -282,6 +339,12 @@ def _leaves(batch: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[NestedKey,
             yield (*path, key) if path else key, value
         elif is_tensor_collection(value) and not is_non_tensor(value):
             yield from _leaves(value, (*path, key))
+
+
+def _write(batch: TensorDictBase, key: NestedKey, value: Tensor) -> None:
+    """Write a signal, found to fit when the update was recorded: checks take half of a write."""
+    path = (key,) if isinstance(key, str) else key
+    batch._set_tuple(path, value, inplace=False, validated=True, non_blocking=False)
 
 
 def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
