@@ -127,7 +127,9 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
     missing = missing_runs(rows)
     of_methods = [run for run in missing if run.rpartition("-")[0].removeprefix("ddpg-") in NAMES]
     if of_methods:
-        sure = f"{len(missing)} of the planned runs are missing, so that every number is provisional."
+        sure = (
+            f"{len(missing)} of the planned runs are missing, so that every number is provisional."
+        )
     else:
         sure = "All runs of the methods are made, and every p is final."
         sure += f" {len(missing)} runs of other settings are missing." if missing else ""

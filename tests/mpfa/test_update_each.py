@@ -47,7 +47,7 @@ def test_round_with_a_batch_that_is_not_finite_ends_before_that_batch():
     for part in rows.clone().split(SIZE)[:2]:
         alone.update(part)
     rows["next", "reward"][2 * SIZE] = torch.nan
-    with pytest.raises(ValueError, match="batch must be finite, got nan in .*, row 0"):
+    with pytest.raises(ValueError, match=r"batch must be finite, got nan in .*, row 0"):
         together.update_each(rows, SIZE)
     assert_alike(alone, together, rtol=0.0, atol=0.0)
 
