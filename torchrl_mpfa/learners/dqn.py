@@ -10,12 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.base import (
-    OptimizedLearner,
-    OptimizerName,
-    check_alike,
-    check_losses,
-)
+from torchrl_mpfa.learners.base import OptimizedLearner, OptimizerName
+from torchrl_mpfa.learners.checks import check_alike, check_losses
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target, read_choices
 from torchrl_mpfa.networks import DirectModule

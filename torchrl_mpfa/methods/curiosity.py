@@ -17,7 +17,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.learners.base import check_losses
+from torchrl_mpfa.learners.checks import check_losses
 
 
 def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
