@@ -45,6 +45,22 @@ def test_difference_interval_covers_the_difference_of_unequal_runs_at_its_level(
     )
 
 
+def test_difference_interval_is_that_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(1.0, 3.0, 5), rng.normal(0.0, 1.0, 20)
+    found = difference_interval(ours, theirs)
+    expected = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx(tuple(expected))
+
+
+def test_difference_interval_of_equal_runs_is_that_of_the_other_side() -> None:
+    other = np.array([94.0, 96.0, 97.5])
+    found, alone = difference_interval(other, np.full(4, 95.5)), mean_interval(other)
+    assert (found.low, found.high) == pytest.approx((alone.low - 95.5, alone.high - 95.5))
+    same = difference_interval(np.full(3, 0.1), np.full(3, 0.1))
+    assert (same.low, same.high) == pytest.approx((0.0, 0.0))
+
+
 def test_intervals_of_one_run_have_no_ends() -> None:
     one, two = np.array([1.0]), np.array([1.0, 2.0])
     for found in (mean_interval(one), difference_interval(one, two), difference_interval(two, one)):
