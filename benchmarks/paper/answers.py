@@ -117,15 +117,33 @@ def training_time(rows: Rows) -> Answer | None:
 
 
 def spread(found: Found) -> Answer | None:
-    """Say how much the success differs by the method, the seed and the learner's additions."""
+    """Say whether the methods differ more than runs of one method, and what the additions do."""
     runs = [found[f"ddpg-{name}"]["success"] for name in NAMES if f"ddpg-{name}" in found]
     if len(runs) < len(NAMES) or min(map(len, runs)) < 2:
         return None
-    deviation = 100 * float(np.sqrt(np.mean([each.var(ddof=1) for each in runs])))
+    means = [float(each.mean()) for each in runs]
+    variances = np.array([each.var(ddof=1) for each in runs])
+    chance = np.sqrt(np.mean(variances / [len(each) for each in runs]))
+    of_means = np.std(means, ddof=1)
+    said = (
+        "The means of the methods differ more than by chance alone."
+        if of_means > chance
+        else "The chance of a run decides success instead: the means of the methods differ no more "
+        "than by chance alone."
+    )
     published = [row.success for paper in (TABLE_2, TABLE_4) for row in paper.values()]
     numbers = [
-        ("success of the methods", _ends(published), _ends([each.mean() for each in runs])),
-        ("standard deviation of runs of one method [points]", "", f"{deviation:.1f}"),
+        ("success of the methods", _ends(published), _ends(means)),
+        (
+            "standard deviation of runs of one method [points]",
+            "",
+            f"{100 * np.sqrt(variances.mean()):.1f}",
+        ),
+        (
+            "standard deviation of the methods' means, and by chance alone [points]",
+            "",
+            f"{100 * of_means:.1f} and {100 * chance:.1f}",
+        ),
     ]
     arms = [(arm, f"ddpg-{arm.split('-')[1]}") for arm in OTHER_ARMS["letter"].values()]
     both = [
@@ -135,11 +153,9 @@ def spread(found: Found) -> Answer | None:
     ]
     if both:
         letter, ours = zip(*both, strict=True)
-        numbers += [
-            ("success of methods to the letter of the paper", "", _ends(letter)),
-            ("success of the same with what keeps DDPG from collapsing", "", _ends(ours)),
-        ]
-    return Answer("", numbers)
+        claim = "success to the letter of the paper, and with what keeps DDPG from collapsing"
+        numbers.append((claim, "", f"{_ends(letter)}, and {_ends(ours)}"))
+    return Answer(said, numbers)
 
 
 def _of(count: int, every: Sequence[object]) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 ROWS = DOCS / "results/paper"
@@ -125,6 +125,21 @@ def test_training_steps_are_those_of_the_rows() -> None:
         assert int(runs) == len(RUNS[f"ddpg-{METHODS[name]}"])
 
 
+def test_training_times_are_those_of_the_rows() -> None:
+    with (ROWS / "times.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    means = {}
+    for name, *_, time, runs in section("Table 3"):
+        minutes = [float(r["minutes"]) for r in rows if r["arm"] == f"ddpg-{METHODS[name]}"]
+        assert_printed(time, minutes, 2)
+        assert int(runs) == len(minutes)
+        means[name] = np.mean(minutes)
+    own = means.pop("MPFA-PER")
+    least, most = min(means.values()), max(means.values())
+    words = f"{own:.1f}, {least:.1f} to {most:.1f}"
+    assert claimed()["minutes of training, MPFA-PER and the others"] == words
+
+
 def arm_of(name: str) -> str:
     method, _, kind = name.partition(", ")
     if name.startswith("φ"):
@@ -163,24 +178,52 @@ def by_deals(ours: list[float], theirs: list[float]) -> list[float]:
     return [gap, gap - reach, gap + reach, p]
 
 
+def found_with_power(gaps: list[float], level: float) -> float:
+    """The true difference that a t-test of the gaps finds in 80 % of all cases."""
+    error = math.sqrt(float(np.var(gaps, ddof=1)) / len(gaps))
+    bound = stats.t.ppf(1 - level / 2, len(gaps) - 1)
+    shift = optimize.brentq(lambda s: stats.nct.sf(bound, len(gaps) - 1, s) - 0.8, 0.1, 50.0)
+    return float(error * shift)
+
+
+def in_steps(ps: list[float]) -> list[float]:
+    """Holm's corrected p: each is the largest of its own and of all smaller ones'."""
+    own = {p: p * sum(other >= p for other in ps) for p in ps}
+    return [min(1.0, max(own[other] for other in ps if other <= p)) for p in ps]
+
+
 @pytest.mark.parametrize("title", ["Neighbors", "Other comparisons"])
 def test_comparisons_are_those_of_the_rows(title: str) -> None:
     count = 0
-    for cells in section(title):
-        if " − " not in cells[0] or not cells[2]:
+    lines = [cells for cells in section(title) if " − " in cells[0]]
+    tests = len(lines)
+    ps, corrected = [], []
+    for cells in lines:
+        if not cells[2]:
+            ps.append(1.0)
             continue
         a, b = (success(arm_of(name)) for name in cells[0].split(" − "))
         common = sorted(a.keys() & b.keys())
         if len(common) >= 6:
-            *points, p = by_signs([a[seed] - b[seed] for seed in common])
+            gaps = [a[seed] - b[seed] for seed in common]
+            *points, p = by_signs(gaps)
+            least = 100 * found_with_power(gaps, 0.05 / tests)
+            assert numbers(cells[6]) == pytest.approx([least], abs=0.0501)
+            assert cells[7] == str(len(common))
         else:
             *points, p = by_deals(list(a.values()), list(b.values()))
+            assert cells[6] == ""
+            assert cells[7] == str(min(len(a), len(b)))
         assert numbers(cells[2]) + numbers(cells[3]) == pytest.approx(
             [100 * each for each in points], abs=0.0501
         )
         assert numbers(cells[4]) == pytest.approx([p], abs=0.000501)
+        ps.append(p)
+        corrected.append(numbers(cells[5])[0])
         count += 1
     assert count >= 11
+    made = [p for p, cells in zip(in_steps(ps), lines, strict=True) if cells[2]]
+    assert corrected == pytest.approx(made, abs=0.000501)
 
 
 def test_other_settings_are_those_of_the_rows() -> None:
@@ -201,31 +244,56 @@ def test_other_settings_are_those_of_the_rows() -> None:
     assert count >= 9
 
 
-def test_numbers_beside_the_papers_claims_are_those_of_the_rows() -> None:
-    ours = {claim: number for claim, _, number in section("The paper's claims")}
-    of_all = {name: 100 * np.mean([*success(f"ddpg-{m}").values()]) for name, m in METHODS.items()}
-    a, b = success("ddpg-mpfa_per"), success("ddpg-per")
-    common = sorted(a.keys() & b.keys())
-    if len(common) >= 6:
-        gap, low, high, p = by_signs([a[seed] - b[seed] for seed in common])
-    else:
-        gap, low, high, p = by_deals([*a.values()], [*b.values()])
-    both = f"{of_all['MPFA-PER']:.1f}% and {of_all['PER']:.1f}%"
-    assert ours["success of MPFA-PER and of PER"] == both
-    interval = f"{100 * gap:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}], p = {p:.3f}"
+def claimed() -> dict[str, str]:
+    return {claim: number for claim, _, number in section("The paper's claims")}
+
+
+def success_of_methods() -> dict[str, list[float]]:
+    """Success of each run of each method, in per cent."""
+    return {
+        name: [100 * each for each in success(f"ddpg-{method}").values()]
+        for name, method in METHODS.items()
+    }
+
+
+def test_difference_of_mpfa_per_and_per_is_that_of_the_rows() -> None:
+    ours, (a, b) = claimed(), (success_of_methods()[name] for name in ("MPFA-PER", "PER"))
+    assert ours["success of MPFA-PER and of PER"] == f"{np.mean(a):.1f}% and {np.mean(b):.1f}%"
+    gaps = [x - y for x, y in zip(a, b, strict=True)]
+    gap, low, high, p = by_signs(gaps)
+    interval = f"{gap:+.1f} [{low:+.1f}, {high:+.1f}], p = {p:.3f}"
     assert ours["MPFA-PER − PER [points], 95 %, p"] == interval
-    ends = f"{min(of_all.values()):.1f}% to {max(of_all.values()):.1f}%"
-    assert ours["success of the methods"] == ends
-    spread = np.mean([np.var([*success(f"ddpg-{m}").values()], ddof=1) for m in METHODS.values()])
+    enough = int(ours["seeds that find one point with 80 % power, at a level of 5 %"])
+    for seeds, found in ((enough, True), (enough - 1, False)):
+        bound = stats.t.ppf(0.975, seeds - 1)
+        shift = math.sqrt(seeds) / np.std(gaps, ddof=1)
+        assert (stats.nct.sf(bound, seeds - 1, shift) >= 0.8) == found
+
+
+def test_spread_of_methods_and_of_their_runs_is_that_of_the_rows() -> None:
+    ours, runs = claimed(), success_of_methods()
+    means = [np.mean(each) for each in runs.values()]
+    assert ours["success of the methods"] == f"{min(means):.1f}% to {max(means):.1f}%"
+    variance = np.mean([np.var(each, ddof=1) for each in runs.values()])
+    of_means, chance = np.std(means, ddof=1), math.sqrt(variance / 10)
     deviation = ours["standard deviation of runs of one method [points]"]
-    assert deviation == f"{100 * math.sqrt(spread):.1f}"
-    arms = ("mpfa_per", "per", "uniform")
-    for end, words in (
-        ("plain-{}-letter", "success of methods to the letter of the paper"),
-        ("ddpg-{}", "success of the same with what keeps DDPG from collapsing"),
-    ):
-        means = [100 * np.mean([*success(end.format(arm)).values()]) for arm in arms]
-        assert ours[words] == f"{min(means):.1f}% to {max(means):.1f}%"
+    assert deviation == f"{math.sqrt(variance):.1f}"
+    words = "standard deviation of the methods' means, and by chance alone [points]"
+    assert ours[words] == f"{of_means:.1f} and {chance:.1f}"
+    page = " ".join((DOCS / "results/paper.md").read_text(encoding="utf-8").split())
+    more = "more" if of_means > chance else "no more"
+    assert f"means of the methods differ {more} than by chance alone" in page
+    ranges = []
+    for name in ("plain-{}-letter", "ddpg-{}"):
+        every = [success(name.format(each)).values() for each in ("mpfa_per", "per", "uniform")]
+        ends = [100 * end(np.mean([*each]) for each in every) for end in (min, max)]
+        ranges.append("{:.1f}% to {:.1f}%".format(*ends))
+    words = "success to the letter of the paper, and with what keeps DDPG from collapsing"
+    assert ours[words] == ", and ".join(ranges)
+
+
+def test_order_of_methods_is_that_of_the_rows() -> None:
+    ours = claimed()
     for table in ("Table 2", "Table 4"):
         pairs = [(numbers(cells[3])[0], success(arm_of(cells[0]))) for cells in section(table)]
         tau, p = stats.kendalltau(
@@ -233,8 +301,10 @@ def test_numbers_beside_the_papers_claims_are_those_of_the_rows() -> None:
         )
         claim = f"Kendall's rank correlation with the order of {table}, exploratory"
         assert ours[claim] == f"{tau:+.2f}, p = {p:.3f}"
-    longer = [np.mean(steps(f"ddpg-{METHODS[c[0]]}")) for c in section("Table 3")]
-    *others, own = longer
+    better = [numbers(c[2])[0] > 0 and numbers(c[5])[0] < 0.05 for c in section("Neighbors")]
+    claim = "neighbors of which the paper's better one is better, corrected p < 0.05"
+    assert ours[claim] == f"{sum(better)} of {len(better)}"
+    *others, own = (np.mean(steps(f"ddpg-{METHODS[c[0]]}")) for c in section("Table 3"))
     count = sum(each > own for each in others)
     claim = "methods of Table 3 with more training steps than MPFA-PER, in the mean"
     assert ours[claim] == f"{count} of 5"
