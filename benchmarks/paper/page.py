@@ -57,8 +57,7 @@ The factor φ of the raise, as in Fig. 5. These runs train for 100 episodes in w
 obstacles. So most of their tests in the unseen world end in collisions.
 """
 _ROBOTS = """
-One robot with one update per action beside sixteen robots with sixteen updates. An arm without a
-row has no runs yet.
+One robot with one update per action beside sixteen robots with sixteen updates.
 """
 _LETTER = """
 To the letter of the paper (`learner=plain`): without the additions that keep DDPG from collapsing,
@@ -130,9 +129,13 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
         sure = (
             f"{len(missing)} of the planned runs are missing, so that every number is provisional."
         )
+    elif missing:
+        sure = (
+            "All runs of the methods are made, and every p is final. "
+            f"{len(missing)} runs of other settings are missing."
+        )
     else:
-        sure = "All runs of the methods are made, and every p is final."
-        sure += f" {len(missing)} runs of other settings are missing." if missing else ""
+        sure = "All planned runs are made, and every p is final."
     made = answers(rows, found)
     answer = " ".join(each.said for each in made if each.said)
     head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", _CHANGED]
