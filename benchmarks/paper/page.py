@@ -49,8 +49,9 @@ _CHANGED = """
 """
 _STEPS = """
 A step is an action of 0.2 s. Times are those of runs that had the machine to themselves, one after
-another. The machine is a virtual one, whose speed was seen to double within ten minutes. So its
-times order nothing by themselves.
+another. DDPG + RAdam trains a curiosity model as well, and KLPER draws three batches for an update.
+These two took the longest. The machine is a virtual one, whose speed was seen to double within ten
+minutes. Smaller differences may come from that.
 """
 _PHI = """
 The factor φ of the raise, as in Fig. 5. These runs train for 100 episodes in world A, which has no
