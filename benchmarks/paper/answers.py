@@ -140,7 +140,7 @@ def spread(found: Found) -> Answer | None:
             f"{100 * np.sqrt(variances.mean()):.1f}",
         ),
         (
-            "standard deviation of the methods' means, and by chance alone [points]",
+            "standard deviation of the methods' means, and by chance alone [points], exploratory",
             "",
             f"{100 * of_means:.1f} and {100 * chance:.1f}",
         ),
