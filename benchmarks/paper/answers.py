@@ -117,32 +117,31 @@ def training_time(rows: Rows) -> Answer | None:
 
 
 def spread(found: Found) -> Answer | None:
-    """Say whether the methods differ more than runs of one method, and what the additions do."""
+    """Say whether the method or the run decides success, and what the additions do."""
     runs = [found[f"ddpg-{name}"]["success"] for name in NAMES if f"ddpg-{name}" in found]
     if len(runs) < len(NAMES) or min(map(len, runs)) < 2:
         return None
-    means = [float(each.mean()) for each in runs]
-    variances = np.array([each.var(ddof=1) for each in runs])
-    chance = np.sqrt(np.mean(variances / [len(each) for each in runs]))
-    of_means = np.std(means, ddof=1)
+    deviation = 100 * float(np.sqrt(np.mean([each.var(ddof=1) for each in runs])))
+    every = np.concatenate(runs)
+    whole = float(((every - every.mean()) ** 2).sum())
+    within = sum(float(((each - each.mean()) ** 2).sum()) for each in runs)
+    share = 1.0 - within / whole if whole else 0.0
+    groups, rest = len(runs) - 1, len(every) - len(runs)
+    # The test of an analysis of variance, which the share decides without a quotient by zero.
+    p = stats.beta.sf(share, groups / 2, rest / 2)
+    decides = "method" if share > 0.5 else "run"
     said = (
-        "The means of the methods differ more than by chance alone."
-        if of_means > chance
-        else "The chance of a run decides success instead: the means of the methods differ no more "
-        "than by chance alone."
+        f"The {decides} decides success: {1 - share:.0%} of the variance lies between runs of one "
+        "method."
     )
     published = [row.success for paper in (TABLE_2, TABLE_4) for row in paper.values()]
     numbers = [
-        ("success of the methods", _ends(published), _ends(means)),
+        ("success of the methods", _ends(published), _ends([each.mean() for each in runs])),
+        ("standard deviation of runs of one method [points]", "", f"{deviation:.1f}"),
         (
-            "standard deviation of runs of one method [points]",
+            "share of the variance that the method explains, and by chance alone, exploratory",
             "",
-            f"{100 * np.sqrt(variances.mean()):.1f}",
-        ),
-        (
-            "standard deviation of the methods' means, and by chance alone [points], exploratory",
-            "",
-            f"{100 * of_means:.1f} and {100 * chance:.1f}",
+            f"{share:.1%} and {groups / (groups + rest):.1%}, p = {p:.3f}",
         ),
     ]
     arms = [(arm, f"ddpg-{arm.split('-')[1]}") for arm in OTHER_ARMS["letter"].values()]

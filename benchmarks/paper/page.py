@@ -125,18 +125,11 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
     paper = {f"ddpg-{name}": row.success for name, row in {**TABLE_2, **TABLE_4}.items()}
     planned = [(f"ddpg-{a}", f"ddpg-{b}") for a, b in neighbors()]
     missing = missing_runs(rows)
-    of_methods = [run for run in missing if run.rpartition("-")[0].removeprefix("ddpg-") in NAMES]
-    if of_methods:
-        sure = (
-            f"{len(missing)} of the planned runs are missing, so that every number is provisional."
-        )
-    elif missing:
-        sure = (
-            "All runs of the methods are made, and every p is final. "
-            f"{len(missing)} runs of other settings are missing."
-        )
-    else:
-        sure = "All planned runs are made, and every p is final."
+    sure = (
+        f"{len(missing)} of the planned runs are missing, so that every number is provisional."
+        if missing
+        else "All planned runs are made, and every p is final."
+    )
     made = answers(rows, found)
     answer = " ".join(each.said for each in made if each.said)
     head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", _CHANGED]

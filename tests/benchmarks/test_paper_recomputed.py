@@ -277,14 +277,14 @@ def test_spread_of_methods_and_of_their_runs_is_that_of_the_rows() -> None:
     means = [np.mean(each) for each in runs.values()]
     assert ours["success of the methods"] == f"{min(means):.1f}% to {max(means):.1f}%"
     variance = np.mean([np.var(each, ddof=1) for each in runs.values()])
-    of_means, chance = np.std(means, ddof=1), math.sqrt(variance / 10)
     deviation = ours["standard deviation of runs of one method [points]"]
     assert deviation == f"{math.sqrt(variance):.1f}"
-    words = "standard deviation of the methods' means, and by chance alone [points], exploratory"
-    assert ours[words] == f"{of_means:.1f} and {chance:.1f}"
+    test = stats.f_oneway(*runs.values())
+    share = 1 - 117 * variance / (129 * np.var(np.concatenate([*runs.values()]), ddof=1))
+    words = "share of the variance that the method explains, and by chance alone, exploratory"
+    assert ours[words] == f"{share:.1%} and {12 / 129:.1%}, p = {test.pvalue:.3f}"
     page = " ".join((DOCS / "results/paper.md").read_text(encoding="utf-8").split())
-    more = "more" if of_means > chance else "no more"
-    assert f"means of the methods differ {more} than by chance alone" in page
+    assert f"The run decides success: {1 - share:.0%} of the variance lies between" in page
     ranges = []
     for name in ("plain-{}-letter", "ddpg-{}"):
         every = [success(name.format(each)).values() for each in ("mpfa_per", "per", "uniform")]
