@@ -5,6 +5,7 @@ import torch
 
 from tests.mpfa.compiled import UNTRACED, assert_alike
 from tests.mpfa.losses import make_batch, make_learner
+from torchrl_mpfa import ActorCriticLearner
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:No target network updater"),
@@ -56,3 +57,18 @@ def test_round_without_a_program_changes_nothing():
     learner, untouched = make_learner("ddpg"), make_learner("ddpg")
     assert learner.update_each(make_rows(2), SIZE) is None
     assert_alike(learner, untouched, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("of_class", [True, False], ids=["class", "instance"])
+def test_round_is_left_to_an_update_of_ones_own(of_class):
+    class Own(ActorCriticLearner):
+        def update(self, sampled):
+            return super().update(sampled)
+
+    learner = make_learner("ddpg", compile=UNTRACED)
+    if of_class:
+        learner.__class__ = Own
+    else:
+        learner.update = lambda sampled: {}
+    assert learner.update_each(make_rows(2), SIZE) is None
+    assert learner.updates == 0

@@ -335,14 +335,16 @@ class ActorCriticLearner(OptimizedLearner):
             batch_size: ``B``.
 
         Returns:
-            The log of the last update; None, before anything is done, without a program.
+            The log of the last update; None, before anything is done, without a program or with an
+            ``update`` of one's own.
 
         Raises:
             KeyError: As :meth:`update`.
             RuntimeError: As :meth:`update`.
             ValueError: As :meth:`update`, of whose kind the earlier ones were made.
         """
-        if self._program is None:
+        own = getattr(self.update, "__func__", None) is not ActorCriticLearner.update
+        if self._program is None or own:
             return None
         self._look()
         counts = range(self.updates + 1, self.updates + 1 + len(rows) // batch_size)
