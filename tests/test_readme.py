@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_mpfa.methods import METHODS
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -47,3 +49,8 @@ def test_no_line_is_longer_than_a_page_is_wide() -> None:
 def test_it_has_one_example_and_110_lines_at_most() -> None:
     assert len(BLOCKS) == 1
     assert len(README.splitlines()) <= 110
+
+
+def test_number_of_methods_is_that_of_the_catalogue() -> None:
+    for page in ("README.md", "docs/peers.md", ".ci/site_cards.md"):
+        assert f"{len(METHODS)} named methods" in (ROOT / page).read_text(encoding="utf-8")

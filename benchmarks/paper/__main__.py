@@ -1,7 +1,7 @@
 """``python -m benchmarks.paper [COMMAND]``: the paper's tables and figures, made again.
 
     python -m benchmarks.paper                 write docs/results/paper.md from the kept rows
-    python -m benchmarks.paper run             make the runs that have no rows yet; eight hours
+    python -m benchmarks.paper run             make the runs that have no rows yet; thirteen hours
     python -m benchmarks.paper time            make the runs of Table 3's times, one at a time
     python -m benchmarks.paper keep            add the rows of finished runs, and make none
 
@@ -22,8 +22,8 @@ import training.extra  # noqa: F401
 # isort: split
 from benchmarks.paper.page import write_page
 from benchmarks.paper.published import TABLE_3
-from benchmarks.paper.rows import FOLDER, keep, keep_time, read_rows
-from benchmarks.paper.runs import BLOCKS, SEEDS, comparisons, without
+from benchmarks.paper.rows import FOLDER, QUESTION, keep, keep_time, read_rows
+from benchmarks.paper.runs import BLOCKS, SEEDS, comparisons, question, without
 from training import files
 from training.comparison.execution import make_runs
 from training.settings.train import register
@@ -76,21 +76,23 @@ def _write(rows: Path, output: Path | None) -> int:
 
 def _keep(folder: Path, rows: Path) -> int:
     """Add the rows of finished runs, and name the runs."""
-    for name in keep(folder, rows):
-        print(f"kept: {name}")
+    for planned, to in ((comparisons(folder), rows), ([question(folder)], rows / QUESTION)):
+        for name in keep(planned, to):
+            print(f"kept: {name}")
     return 0
 
 
 def _make(folder: Path, rows: Path, jobs: int) -> int:
     """Make the runs that have no rows, a few at a time, and keep their rows after each seed."""
     worst = 0
-    for seeds in BLOCKS:
-        for comparison in comparisons(folder, seeds):
-            for part in without(comparison, read_rows(rows).runs):
-                worst = max(worst, make_runs(part, most=jobs))
-                _keep(folder, rows)
-                if worst >= 128:
-                    return worst
+    planned = [comparison for seeds in BLOCKS for comparison in comparisons(folder, seeds)]
+    for comparison in (*planned, question(folder)):
+        kept = read_rows(rows).runs | read_rows(rows / QUESTION).runs
+        for part in without(comparison, kept):
+            worst = max(worst, make_runs(part, most=jobs))
+            _keep(folder, rows)
+            if worst >= 128:
+                return worst
     return worst
 
 

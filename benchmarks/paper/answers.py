@@ -10,10 +10,19 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from benchmarks.paper.published import NAMES, TABLE_2, TABLE_3, TABLE_4, in_order, neighbors
+from benchmarks.paper.failures import PUBLISHED, ratio_interval, ratio_text
+from benchmarks.paper.published import (
+    MARK,
+    NAMES,
+    TABLE_2,
+    TABLE_3,
+    TABLE_4,
+    in_order,
+    neighbors,
+)
 from benchmarks.paper.rows import Rows
-from benchmarks.paper.tables import OTHER_ARMS, difference
-from training.statistics import detectable, holm
+from benchmarks.paper.tables import FEWEST, OTHER_ARMS, difference
+from training.statistics import chance, detectable, holm
 
 Found = Mapping[str, pd.DataFrame]
 """Measures of each run, by arm."""
@@ -43,42 +52,100 @@ def order(found: Found) -> Answer | None:
             return None
         ours = [found[f"ddpg-{name}"]["success"].mean() for name in names]
         tau, p = stats.kendalltau([paper[name].success for name in names], ours)
-        claim = f"Kendall's rank correlation with the order of Table {number}, exploratory"
-        taus.append((claim, "+1.00", f"{tau:+.2f}, p = {p:.3f}"))
-    made = [difference(found, f"ddpg-{a}", f"ddpg-{b}") for a, b in neighbors()]
-    corrected = holm(np.array([1.0 if each is None else each.p for each in made]))
+        mark = MARK if number == 4 else ""
+        claim = f"Kendall's rank correlation with the order of Table {number}{mark}, exploratory"
+        taus.append((claim, "", f"{tau:+.2f}, p = {p:.3f}"))
+    pairs = neighbors()
+    differences = [difference(found, f"ddpg-{a}", f"ddpg-{b}", tests=len(pairs)) for a, b in pairs]
+    corrected = holm(np.array([1.0 if gap is None else gap.p for gap in differences]))
     seen = [
-        each is not None and each.gap.value > 0 and p < 0.05
-        for each, p in zip(made, corrected, strict=True)
+        gap is not None and gap.gap.value > 0 and p < 0.05
+        for gap, p in zip(differences, corrected, strict=True)
     ]
-    claim = "neighbors of which the paper's better one is better, corrected p < 0.05"
-    pairs = claim, _of(len(seen), seen), _of(sum(seen), seen)
+    published = [PUBLISHED[b] - PUBLISHED[a] for a, b in pairs]
+    level = 0.05 / len(pairs)
+    small, none = [], 1.0
+    for gap, points in zip(differences, published, strict=True):
+        if gap is None or not math.isfinite(gap.detectable):
+            small.append(False)
+            continue
+        small.append(points < gap.detectable)
+        if gap.detectable:
+            deviation = gap.detectable / detectable(1.0, gap.seeds, level=level)
+            none *= 1.0 - chance(points, deviation, gap.seeds, level=level)
+    ahead = sum(points > 1e-9 for points in published)
     said = f"The paper's order of the methods is {'' if all(seen) else 'not '}confirmed."
-    return Answer(said, [pairs, *taus])
+    if all(small) and not any(seen):
+        said += (
+            f" None of {len(small)} neighbors was found to differ. That was likely, whether the "
+            f"paper is right or not: with its differences the chance is {none:.0%}, as each is "
+            "smaller than what our seeds find with 80 % power."
+        )
+    numbers = [
+        (
+            f"neighbors{MARK} of which the paper's better one is better; ours: corrected p < 0.05",
+            f"{_of(ahead, pairs)}, untested",
+            _of(sum(seen), seen),
+        ),
+        (
+            f"neighbors{MARK} whose difference in the paper is below what we find with 80 % power",
+            "",
+            _of(sum(small), small),
+        ),
+        (
+            f"chance to find no neighbors{MARK} that differ, if the paper's differences are true",
+            "",
+            f"{none:.0%}",
+        ),
+        *taus,
+    ]
+    return Answer(said, numbers)
 
 
 def against_per(found: Found) -> Answer | None:
-    """Say whether MPFA-PER reaches more goals than PER, and which differences are excluded."""
+    """Say whether MPFA-PER fails less often than PER, and where the paper's ratio lies."""
     made = difference(found, "ddpg-mpfa_per", "ddpg-per")
     if made is None:
         return None
-    ours, theirs = (found[f"ddpg-{name}"]["success"].mean() for name in ("mpfa_per", "per"))
-    value, low, high = (100 * each for each in (made.gap.value, made.gap.low, made.gap.high))
-    claimed = [TABLE_2[name].success for name in ("mpfa_per", "per")]
-    published = 100 * (claimed[0] - claimed[1])
-    better = "is better" if low > 0 else "is worse" if high < 0 else "was not seen to be better"
-    where = "inside the interval" if low <= published <= high else "excluded"
-    said = f"MPFA-PER {better} than PER, and the paper's difference is {where}."
+    ours, theirs = (1.0 - found[f"ddpg-{name}"]["success"] for name in ("mpfa_per", "per"))
+    value, low, high = (100 * end for end in (made.gap.value, made.gap.low, made.gap.high))
+    claimed = [PUBLISHED[name] for name in ("mpfa_per", "per")]
+    ratio, odds = claimed[0] / claimed[1], _odds(claimed[0]) / _odds(claimed[1])
+    seen = (
+        "fails less often than PER"
+        if low > 0
+        else "fails more often than PER"
+        if high < 0
+        else "was not seen to fail less often than PER"
+    )
+    where = "inside" if made.ratio.low <= ratio <= made.ratio.high else "outside of"
+    said = (
+        f"MPFA-PER {seen}, in {made.seeds} seeds. The paper's ratio of failures lies {where} our "
+        "interval."
+    )
     numbers = [
         (
-            "success of MPFA-PER and of PER",
-            " and ".join(f"{each:.1%}" for each in claimed),
-            f"{ours:.1%} and {theirs:.1%}",
+            "failures of MPFA-PER and of PER",
+            " and ".join(f"{share:.1%}" for share in claimed),
+            f"{ours.mean():.1%} and {theirs.mean():.1%}",
+        ),
+        ("ratio of failures MPFA-PER / PER, 95 %", f"{ratio:.2f}", ratio_text(made.ratio)),
+    ]
+    if made.seeds >= FEWEST:
+        common = ours.index.intersection(theirs.index)
+        pair = (runs[common].to_numpy(dtype=float) for runs in (ours, theirs))
+        text = ratio_text(ratio_interval(*pair, paired=True, odds=True))
+        numbers.append(("ratio of the odds of failure, 95 %", f"{odds:.2f}", text))
+    numbers += [
+        (
+            "success, MPFA-PER − PER [points], 95 %, p",
+            f"{100 * (claimed[1] - claimed[0]):+.1f}",
+            f"{value:+.1f} [{low:+.1f}, {high:+.1f}], p = {made.p:.3f}",
         ),
         (
-            "MPFA-PER − PER [points], 95 %, p",
-            f"{published:+.1f}",
-            f"{value:+.1f} [{low:+.1f}, {high:+.1f}], p = {made.p:.3f}",
+            "from PER's success to the ceiling of 100 % [points]",
+            f"{100 * claimed[1]:.1f}",
+            f"{100 * theirs.mean():.1f}",
         ),
     ]
     if low <= 0.0 <= high and math.isfinite(made.detectable):
@@ -104,15 +171,16 @@ def training_time(rows: Rows) -> Answer | None:
     most = {0: "the most", len(others): "the fewest"}.get(longer, "neither the most nor the fewest")
     said = (
         f"In the mean of its runs MPFA-PER takes {most} training steps of Table 3, and in the "
-        "paper the fewest. No test compares the steps."
+        f"paper the fewest. No test compares the steps, and the {len(others)} others are "
+        f"reconstructions{MARK}."
     )
-    claim = "methods of Table 3 with more training steps than MPFA-PER, in the mean"
+    claim = f"methods{MARK} of Table 3 with more training steps than MPFA-PER, in the mean"
     numbers = [(claim, _of(len(others), others), _of(longer, others))]
     minutes = rows.times.groupby("arm")["minutes"].mean()
     if len(minutes) == len(TABLE_3):
         rest = minutes.drop("ddpg-mpfa_per")
         taken = f"{minutes['ddpg-mpfa_per']:.1f}, {rest.min():.1f} to {rest.max():.1f}"
-        numbers.append(("minutes of training, MPFA-PER and the others", "", taken))
+        numbers.append((f"minutes of training, MPFA-PER and the others{MARK}", "", taken))
     return Answer(said, numbers)
 
 
@@ -155,6 +223,10 @@ def spread(found: Found) -> Answer | None:
         claim = "success to the letter of the paper, and with what keeps DDPG from collapsing"
         numbers.append((claim, "", f"{_ends(letter)}, and {_ends(ours)}"))
     return Answer(said, numbers)
+
+
+def _odds(share: float) -> float:
+    return share / (1.0 - share)
 
 
 def _of(count: int, every: Sequence[object]) -> str:

@@ -23,7 +23,11 @@ class Trained(NamedTuple):
     steps: int
 
 
-NAMES = {
+RECONSTRUCTED = ("klper", "ddpg_radam", "hvper", "averaged_ddpg", "mw")
+"""Methods of others of which too little is published: ours say nothing about the originals."""
+MARK = "†"
+"""Stands behind the name of what is, or rests on, a reconstruction."""
+_NAMES = {
     "mpfa_per": "MPFA-PER",
     "per": "PER",
     "td_reward": "TD-error + reward",
@@ -38,6 +42,7 @@ NAMES = {
     "mw": "MW-MADDPG",
     "uniform": "uniform",
 }
+NAMES = {name: text + MARK * (name in RECONSTRUCTED) for name, text in _NAMES.items()}
 """The paper's names of the methods. No table of the paper has uniform replay."""
 TESTS = 200
 """Tests of each method in Tables 2 and 4."""

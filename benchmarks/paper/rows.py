@@ -2,13 +2,15 @@
 
 A folder of rows holds ``tests.csv.gz``, the tests of every run in the unseen world,
 ``curves.csv.gz``, its evaluations during training, ``episodes/RUN.csv.gz``, its training episodes,
-and ``times.csv``, training times of runs that had the machine to themselves.
+and ``times.csv``, training times of runs that had the machine to themselves. Its folder
+``question`` holds those of the runs that decide whether MPFA-PER fails less often than PER.
 """
 
 from __future__ import annotations
 
 import gzip
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +18,13 @@ import pandas as pd
 
 from benchmarks.paper.runs import finished
 from training import files
-from training.comparison.jobs import Job
+from training.comparison.jobs import Comparison, Job
 from training.records import read_table
 
 FOLDER = Path("docs/results/paper")
 """Rows of the runs that the page reports."""
+QUESTION = "question"
+"""Folder, within one of rows, of those that were not looked at before all of them were there."""
 RUN = ["arm", "seed"]
 TESTS = [*RUN, "episode", "success", "collision", "spl", "time_s"]
 CURVES = [*RUN, "total_steps", "success"]
@@ -72,10 +76,10 @@ def read_rows(folder: Path) -> Rows:
     return Rows(folder, *tables)
 
 
-def keep(runs: Path, folder: Path) -> list[str]:
+def keep(planned: Iterable[Comparison], folder: Path) -> list[str]:
     """Add the rows of finished runs to those in a folder; return the names of these runs."""
     there = read_rows(folder)
-    new = [found for found in finished(runs) if found[1].name not in there.runs]
+    new = [run for run in finished(planned) if run[1].name not in there.runs]
     tests, curves = [there.tests], [there.curves]
     for comparison, job in new:
         for tables, path, columns in (

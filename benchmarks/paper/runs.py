@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,8 @@ FEW = {"letter": range(100, 105), "one_robot": range(100, 103)}
 """Seeds of the arms that have fewer."""
 BLOCKS = (SEEDS[:5], SEEDS[5:])
 """Seeds in the order in which they are made: five of all arms before the next five."""
+NEW_SEEDS = range(110, 146)
+"""Seeds that decide whether MPFA-PER fails less often than PER."""
 
 
 def comparisons(folder: Path, seeds: Sequence[int] = SEEDS) -> list[Comparison]:
@@ -47,6 +49,16 @@ def comparisons(folder: Path, seeds: Sequence[int] = SEEDS) -> list[Comparison]:
     ]
 
 
+def question(folder: Path) -> Comparison:
+    """Return the comparison that decides whether MPFA-PER fails less often than PER.
+
+    Examples:
+        >>> len(question(Path("runs/paper")).jobs)
+        108
+    """
+    return Comparison(folder, CLAIMS, SETTINGS, NEW_SEEDS)
+
+
 def without(comparison: Comparison, kept: set[str]) -> Iterator[Comparison]:
     """Yield the parts of a comparison, a seed each, whose runs are not among those kept."""
     for seed in comparison.seeds:
@@ -62,11 +74,11 @@ def without(comparison: Comparison, kept: set[str]) -> Iterator[Comparison]:
                 yield replace(one, methods=tuple(methods), arms=arms)
 
 
-def finished(folder: Path) -> list[tuple[Comparison, Job]]:
-    """Return the runs in a folder that are trained and evaluated."""
+def finished(planned: Iterable[Comparison]) -> list[tuple[Comparison, Job]]:
+    """Return the planned runs that are trained and evaluated."""
     return [
         (comparison, job)
-        for comparison in comparisons(folder)
+        for comparison in planned
         for job in comparison.jobs
         if job.is_evaluated(comparison.evaluation)
     ]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from benchmarks.paper.failures import ratio_interval, ratio_text
 from benchmarks.paper.published import NAMES, PHIS, TABLE_3, TESTS, Tested
 from benchmarks.paper.rows import Rows
 from benchmarks.paper.runs import CLAIMS, LETTER, ONE_ROBOT
@@ -124,6 +125,8 @@ class Difference:
     """Of the permutation test."""
     detectable: float
     """Difference that a test at its level finds with 80 % power; NaN for arms not paired."""
+    ratio: Interval
+    """Ratio of failures; its ends are NaN for arms not paired."""
 
 
 def difference(
@@ -143,36 +146,44 @@ def difference(
         x, y = a.to_numpy(), b.to_numpy()
         fewer = min(len(x), len(y))
         gap, p = difference_interval(x, y), permutation_p(x, y)
-        return Difference(ours, theirs, fewer, gap, p, math.nan)
+        whole = ratio_interval(1.0 - x, 1.0 - y, paired=False).value
+        no_ends = Interval(whole, math.nan, math.nan)
+        return Difference(ours, theirs, fewer, gap, p, math.nan, no_ends)
     gaps = (a[common] - b[common]).to_numpy()
     least = detectable(float(gaps.std(ddof=1)), len(gaps), level=0.05 / tests)
-    return Difference(ours, theirs, len(gaps), mean_interval(gaps), sign_p(gaps), least)
+    x, y = (1.0 - runs[common].to_numpy(dtype=float) for runs in (a, b))
+    ratio = ratio_interval(x, y, paired=True)
+    return Difference(ours, theirs, len(gaps), mean_interval(gaps), sign_p(gaps), least, ratio)
 
 
 def comparison_table(
     found: Mapping[str, pd.DataFrame],
     pairs: Sequence[tuple[str, str]],
-    published: Mapping[str, float] | None = None,
+    published: Mapping[str, float],
 ) -> str:
     """Return a table of pairs of arms, corrected by Holm's method, with the paper's success."""
-    made = [difference(found, *pair, tests=len(pairs)) for pair in pairs]
-    corrected = holm(np.array([1.0 if each is None else each.p for each in made]))
+    differences = [difference(found, *pair, tests=len(pairs)) for pair in pairs]
+    corrected = holm(np.array([1.0 if gap is None else gap.p for gap in differences]))
     lines = []
-    for pair, each, p in zip(pairs, made, corrected, strict=True):
-        cells = [f"{_name(pair[0])} − {_name(pair[1])}"]
-        if published is not None:
-            known = pair[0] in published and pair[1] in published
-            cells.append(_points(published[pair[0]] - published[pair[1]]) if known else "")
-        if each is None:
-            lines.append([*cells, *[""] * 6])
+    for pair, made, p in zip(pairs, differences, corrected, strict=True):
+        theirs = [published[arm] for arm in pair if arm in published]
+        ratio, points = "", ""
+        if len(theirs) == 2:
+            ratio = f"{(1.0 - theirs[0]) / (1.0 - theirs[1]):.2f}"
+            points = _points(theirs[0] - theirs[1])
+        cells = [" − ".join(map(_name, pair)), ratio]
+        if made is None:
+            lines.append([*cells, "", points, *[""] * 5])
             continue
-        ends = f"[{_points(each.gap.low)}, {_points(each.gap.high)}]"
-        least = "" if math.isnan(each.detectable) else f"{100 * each.detectable:.1f}"
-        ps = [f"{each.p:.3f}", f"{p:.3f}"]
-        lines.append([*cells, _points(each.gap.value), ends, *ps, least, f"{each.seeds}"])
-    paper = ["paper [points]"] if published is not None else []
-    head = ["", *paper, "ours [points]", "95 %", "p", f"p corrected for {len(pairs)}"]
-    return table([*head, "found with 80 % power [points]", "seeds"], lines)
+        ends = f"[{_points(made.gap.low)}, {_points(made.gap.high)}]"
+        single = f"{made.ratio.value:.2f}"
+        failed = single if math.isnan(made.ratio.low) else ratio_text(made.ratio)
+        least = "" if math.isnan(made.detectable) else f"{100 * made.detectable:.1f}"
+        cells += [failed, points, f"{_points(made.gap.value)} {ends}"]
+        lines.append([*cells, f"{made.p:.3f}", f"{p:.3f}", least, f"{made.seeds}"])
+    head = ["", "ratio of failures: paper", "ours, 95 %", "success [points]: paper", "ours, 95 %"]
+    head += ["p", f"p corrected for {len(pairs)}", "found with 80 % power [points]", "seeds"]
+    return table(head, lines)
 
 
 def number(runs: Iterable[float], form: str, *, highest: float = math.inf) -> str:

@@ -155,6 +155,19 @@ def holm(p: Array) -> Array:
     return corrected
 
 
+def chance(gap: float, deviation: float, seeds: int, *, level: float = 0.05) -> float:
+    """Return the chance that a two-sided t-test of paired runs finds a mean difference.
+
+    The deviation is that of the difference from seed to seed.
+
+    Examples:
+        >>> round(chance(1.0, 1.0, 10), 1)
+        0.8
+    """
+    bound = stats.t.ppf(1 - level / 2, seeds - 1)
+    return float(stats.nct.sf(bound, seeds - 1, gap / deviation * math.sqrt(seeds)))
+
+
 def detectable(deviation: float, seeds: int, *, level: float = 0.05, power: float = 0.8) -> float:
     """Return the mean difference that a two-sided t-test of paired runs finds with some power.
 
@@ -164,11 +177,9 @@ def detectable(deviation: float, seeds: int, *, level: float = 0.05, power: floa
         >>> round(detectable(1.0, 10), 1)
         1.0
     """
-    freedom = seeds - 1
-    bound = stats.t.ppf(1 - level / 2, freedom)
-    low, high = 0.0, 100.0
+    low, high = 0.0, 100.0 / math.sqrt(seeds)
     for _ in range(50):
-        shift = (low + high) / 2
-        found = float(stats.nct.sf(bound, freedom, shift))
-        low, high = (low, shift) if found >= power else (shift, high)
-    return deviation * high / math.sqrt(seeds)
+        middle = (low + high) / 2
+        found = chance(middle, 1.0, seeds, level=level) >= power
+        low, high = (low, middle) if found else (middle, high)
+    return deviation * high

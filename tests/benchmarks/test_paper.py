@@ -14,11 +14,12 @@ from scipy import stats
 
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.answers import answers
+from benchmarks.paper.failures import ratio_interval
 from benchmarks.paper.figures import reward_of_blocks, rewards
-from benchmarks.paper.page import missing_runs, missing_table, write_page
+from benchmarks.paper.page import missing_runs, missing_table, question_text, write_page
 from benchmarks.paper.published import NAMES, TABLE_2, TABLE_4, neighbors
 from benchmarks.paper.rows import Rows, keep, keep_time, read_rows
-from benchmarks.paper.runs import comparisons, without
+from benchmarks.paper.runs import CLAIMS, comparisons, question, without
 from benchmarks.paper.tables import comparison_table, difference, measures, unseen_table
 from tests.integration.tiny_runs import tiny, train
 from training import files
@@ -91,8 +92,13 @@ def test_every_planned_run_that_is_kept_has_two_hundred_tests_and_its_episodes()
     for arm in rows.tests["arm"].unique():
         for episodes in rows.episodes(arm).values():
             assert len(episodes) >= (100 if "phi" in arm else 1000)
-    planned = {job.name for each in comparisons(Path()) for job in each.jobs}
+    planned = {job.name for comparison in comparisons(Path()) for job in comparison.jobs}
     assert rows.runs <= planned
+    new = read_rows(ROOT / "docs/results/paper/question")
+    assert new.runs <= {job.name for job in question(Path()).jobs}
+    assert new.tests.groupby(["arm", "seed"]).size().eq(200).all()
+    for arm in new.tests["arm"].unique():
+        assert all(len(episodes) >= 1000 for episodes in new.episodes(arm).values())
     assert rows.runs.isdisjoint(missing_runs(rows))
 
 
@@ -146,19 +152,22 @@ def test_five_seeds_are_compared_by_their_means(tmp_path: Path) -> None:
         [("ddpg-mpfa_per", "ddpg-per"), ("ddpg-mpfa_per", "ddpg-mw")],
         {"ddpg-mpfa_per": 0.905, "ddpg-per": 0.855},
     )
-    assert "| MPFA-PER − PER | +5.0 | +40.0 | [+40.0, +40.0] | 0.008 | 0.016 |  | 5 |" in table
-    assert "| MPFA-PER − MW-MADDPG |  |  |  |  |  |  |  |" in table
+    assert (
+        "| MPFA-PER − PER | 0.66 | 0.20 | +5.0 | +40.0 [+40.0, +40.0] | 0.008 | 0.016 |  | 5 |"
+        in table
+    )
+    assert "| MPFA-PER − MW-MADDPG† |  |  |  |  |  |  |  |  |" in table
 
 
 @pytest.mark.parametrize(
     ("gap", "sentences"),
     [
-        (0.05, ["MPFA-PER is better than PER", "paper's difference is inside the interval"]),
-        (0.0, ["MPFA-PER was not seen to be better", "difference is excluded", "find one point"]),
-        (-0.05, ["MPFA-PER is worse than PER", "difference is excluded"]),
+        (0.05, ["MPFA-PER fails less often than PER", "lies inside our interval"]),
+        (0.0, ["was not seen to fail less often", "lies outside of our", "find one point"]),
+        (-0.05, ["MPFA-PER fails more often than PER", "lies outside of our interval"]),
     ],
 )
-def test_answers_say_which_differences_the_runs_exclude(
+def test_answers_say_where_the_ratio_of_the_paper_lies(
     tmp_path: Path, gap: float, sentences: list[str]
 ) -> None:
     noise = [0.01, -0.01] * 5
@@ -182,6 +191,55 @@ def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
     made = answers(rows, measures(rows))[0]
     assert made.said == "The paper's order of the methods is confirmed."
     assert made.numbers[0][2] == "11 of 11"
+
+
+def asked(folder: Path, shares: dict[str, list[float]]) -> Rows:
+    """Write rows of the question's runs, and return them."""
+    rows = made_up(folder, {f"ddpg-{name}": runs for name, runs in shares.items()})
+    tests = rows.tests.assign(seed=rows.tests["seed"] + 10)
+    tests.to_csv(folder / "tests.csv.gz", index=False)
+    return read_rows(folder)
+
+
+def test_question_with_a_run_missing_says_nothing_of_its_results(tmp_path: Path) -> None:
+    table = measures(made_up(tmp_path / "ten", {f"ddpg-{name}": [0.9] * 10 for name in CLAIMS}))
+    shares = {"mpfa_per": [0.99] * 36, "per": [0.5] * 36, "uniform": [0.5] * 35}
+    text = question_text(asked(tmp_path / "new", shares), table)
+    assert text == [
+        "The planned test of MPFA-PER against PER waits for 1 of its 108 runs.",
+        "107 of 108 runs are kept. None was looked at.",
+    ]
+
+
+def test_question_with_all_runs_compares_failures_of_new_seeds(tmp_path: Path) -> None:
+    noise = np.resize([0.01, -0.01], 36)
+    ten = {"ddpg-mpfa_per": [0.95] * 10, "ddpg-per": [0.95] * 10, "ddpg-uniform": [0.9] * 10}
+    shares = {
+        "mpfa_per": list(0.96 + noise),
+        "per": list(0.92 + noise),
+        "uniform": list(0.92 + noise[::-1]),
+    }
+    rows = asked(tmp_path / "new", shares)
+    said, table = question_text(rows, measures(made_up(tmp_path / "ten", ten)))
+    assert "In 36 new seeds MPFA-PER fails 0.50 times as often as PER, and the planned" in said
+    assert "test does find a difference, p = 0.000." in said
+    primary, second, third = table.splitlines()[2:]
+    assert primary.startswith("| MPFA-PER / PER, primary | 0.66 | 4.00% and 8.00% | 0.50 [0.4")
+    assert "| MPFA-PER / uniform, secondary |  | 4.00% and 8.00% | 0.50 [" in second
+    assert "| 1.00 [" in third
+    assert third.split("|")[5:7] == [" 1.000 ", " 1.000 "]
+    # 46 runs: (36 x 4 + 10 x 5) / (36 x 8 + 10 x 5).
+    assert "| 0.57 [" in primary
+
+
+def test_ratio_of_failures_resamples_pairs_together() -> None:
+    theirs = np.linspace(0.02, 0.2, 10)
+    paired = ratio_interval(0.5 * theirs, theirs, paired=True)
+    apart = ratio_interval(0.5 * theirs, theirs, paired=False)
+    assert (paired.low, paired.value, paired.high) == pytest.approx((0.5, 0.5, 0.5))
+    assert apart.low < 0.4 < 0.6 < apart.high
+    assert np.isnan(ratio_interval(theirs, 0 * theirs, paired=True).value)
+    assert ratio_interval(theirs, theirs[::-1], paired=False, odds=True).value == 1.0
 
 
 def test_neighbors_follow_success_and_then_time() -> None:
@@ -237,8 +295,8 @@ def test_rows_of_a_finished_run_are_kept_once_with_its_time(tmp_path: Path) -> N
     settings = tiny("per", [Stage(world, 1) for world in "ABCD"])
     settings.evaluation.every, settings.evaluation.episodes = 10, 1
     train(job.path, settings)
-    rows = tmp_path / "rows"
-    assert keep(tmp_path / "runs", rows) == []
+    rows, planned = tmp_path / "rows", comparisons(tmp_path / "runs")
+    assert keep(planned, rows) == []
     tested = job.results(comparison.evaluation)
     tested.mkdir()
     write_table(
@@ -262,16 +320,16 @@ def test_rows_of_a_finished_run_are_kept_once_with_its_time(tmp_path: Path) -> N
     }
     said["sha256"] = files.digest(job.path / files.POLICY)
     (tested / files.SETTINGS).write_text(json.dumps(said))
-    assert keep(tmp_path / "runs", rows) == ["ddpg-per-100"]
+    assert keep(planned, rows) == ["ddpg-per-100"]
     kept = read_rows(rows)
     assert kept.runs == {"ddpg-per-100"}
     assert kept.tests["success"].mean() == 0.75
     assert kept.tests["spl"].unique().tolist() == [0.512]
     assert len(kept.curves)
     before = (rows / "tests.csv.gz").read_bytes()
-    assert keep(tmp_path / "runs", rows) == []
+    assert keep(planned, rows) == []
     shutil.rmtree(rows)
-    assert keep(tmp_path / "runs", rows) == ["ddpg-per-100"]
+    assert keep(planned, rows) == ["ddpg-per-100"]
     assert (rows / "tests.csv.gz").read_bytes() == before
     keep_time(job, rows)
     keep_time(job, rows)

@@ -24,13 +24,30 @@ METHODS = {
     "MPF-PER": "mpf_per",
     "Raise priority": "raise",
     "Decay priority": "decay",
-    "KLPER": "klper",
-    "DDPG + RAdam": "ddpg_radam",
-    "HVPER": "hvper",
-    "Averaged-DDPG": "averaged_ddpg",
-    "MW-MADDPG": "mw",
+    "KLPER†": "klper",
+    "DDPG + RAdam†": "ddpg_radam",
+    "HVPER†": "hvper",
+    "Averaged-DDPG†": "averaged_ddpg",
+    "MW-MADDPG†": "mw",
     "uniform": "uniform",
 }
+
+
+PUBLISHED = {
+    "MPFA-PER": 90.5,
+    "PER": 85.5,
+    "TD-error + reward": 88.0,
+    "TD-error + loss": 87.5,
+    "MPF-PER": 89.5,
+    "Raise priority": 89.0,
+    "Decay priority": 88.5,
+    "KLPER†": 88.0,
+    "DDPG + RAdam†": 87.5,
+    "HVPER†": 86.5,
+    "Averaged-DDPG†": 86.0,
+    "MW-MADDPG†": 86.5,
+}
+"""Success in the paper's Tables 2 and 4, in per cent."""
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -135,11 +152,11 @@ def test_training_times_are_those_of_the_rows() -> None:
         assert int(runs) == len(minutes)
         means[name] = np.mean(minutes)
     slowest = sorted(means, key=lambda name: means[name])[-2:]
-    assert slowest == ["KLPER", "DDPG + RAdam"]  # as the text below the table says
+    assert slowest == ["KLPER†", "DDPG + RAdam†"]  # as the text below the table says
     own = means.pop("MPFA-PER")
     least, most = min(means.values()), max(means.values())
     words = f"{own:.1f}, {least:.1f} to {most:.1f}"
-    assert claimed()["minutes of training, MPFA-PER and the others"] == words
+    assert claimed()["minutes of training, MPFA-PER and the others†"] == words
 
 
 def arm_of(name: str) -> str:
@@ -180,6 +197,22 @@ def by_deals(ours: list[float], theirs: list[float]) -> list[float]:
     return [gap, gap - reach, gap + reach, p]
 
 
+def bootstrapped(
+    ours: list[float], theirs: list[float], *, paired: bool, odds: bool = False
+) -> list[float]:
+    """Ratio of two means of failures, or of their odds, and the ends of its 95 % interval."""
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(4000):
+        rows = rng.integers(len(ours), size=len(ours))
+        others = rows if paired else rng.integers(len(theirs), size=len(theirs))
+        a, b = (np.mean([side[i] for i in at]) for side, at in ((ours, rows), (theirs, others)))
+        ratios.append(a / b if not odds else a * (1 - b) / (b * (1 - a)))
+    a, b = np.mean(ours), np.mean(theirs)
+    whole = a / b if not odds else a * (1 - b) / (b * (1 - a))
+    return [float(whole), *np.percentile(ratios, [2.5, 97.5]).tolist()]
+
+
 def found_with_power(gaps: list[float], level: float) -> float:
     """The true difference that a t-test of the gaps finds in 80 % of all cases."""
     error = math.sqrt(float(np.var(gaps, ddof=1)) / len(gaps))
@@ -204,24 +237,31 @@ def test_comparisons_are_those_of_the_rows(title: str) -> None:
         if not cells[2]:
             ps.append(1.0)
             continue
+        if cells[1]:
+            better, worse = (PUBLISHED[name] for name in cells[0].split(" − "))
+            assert numbers(cells[1]) == pytest.approx([(100 - better) / (100 - worse)], abs=0.00501)
+            assert numbers(cells[3]) == pytest.approx([better - worse], abs=0.0501)
         a, b = (success(arm_of(name)) for name in cells[0].split(" − "))
         common = sorted(a.keys() & b.keys())
         if len(common) >= 6:
             gaps = [a[seed] - b[seed] for seed in common]
             *points, p = by_signs(gaps)
             least = 100 * found_with_power(gaps, 0.05 / tests)
-            assert numbers(cells[6]) == pytest.approx([least], abs=0.0501)
-            assert cells[7] == str(len(common))
+            assert numbers(cells[7]) == pytest.approx([least], abs=0.0501)
+            assert cells[8] == str(len(common))
+            ratio = bootstrapped(*([1 - x[seed] for seed in common] for x in (a, b)), paired=True)
+            assert numbers(cells[2])[0] == pytest.approx(ratio[0], abs=0.00501)
+            assert numbers(cells[2])[1:] == pytest.approx(ratio[1:], abs=0.05, rel=0.03)
         else:
             *points, p = by_deals(list(a.values()), list(b.values()))
-            assert cells[6] == ""
-            assert cells[7] == str(min(len(a), len(b)))
-        assert numbers(cells[2]) + numbers(cells[3]) == pytest.approx(
-            [100 * each for each in points], abs=0.0501
-        )
-        assert numbers(cells[4]) == pytest.approx([p], abs=0.000501)
+            assert cells[7] == ""
+            assert cells[8] == str(min(len(a), len(b)))
+            failed = [np.mean([1 - share for share in x.values()]) for x in (a, b)]
+            assert numbers(cells[2]) == pytest.approx([failed[0] / failed[1]], abs=0.00501)
+        assert numbers(cells[4]) == pytest.approx([100 * each for each in points], abs=0.0501)
+        assert numbers(cells[5]) == pytest.approx([p], abs=0.000501)
         ps.append(p)
-        corrected.append(numbers(cells[5])[0])
+        corrected.append(numbers(cells[6])[0])
         count += 1
     assert count >= 11
     made = [p for p, cells in zip(in_steps(ps), lines, strict=True) if cells[2]]
@@ -250,6 +290,10 @@ def claimed() -> dict[str, str]:
     return {claim: number for claim, _, number in section("The paper's claims")}
 
 
+def whole_page() -> str:
+    return " ".join((DOCS / "results/paper.md").read_text(encoding="utf-8").split())
+
+
 def success_of_methods() -> dict[str, list[float]]:
     """Success of each run of each method, in per cent."""
     return {
@@ -258,13 +302,32 @@ def success_of_methods() -> dict[str, list[float]]:
     }
 
 
+def test_failures_of_mpfa_per_and_per_are_those_of_the_rows() -> None:
+    ours, (a, b) = claimed(), (success_of_methods()[name] for name in ("MPFA-PER", "PER"))
+    failed = [[1 - share / 100 for share in runs] for runs in (a, b)]
+    means = [100 * np.mean(runs) for runs in failed]
+    assert ours["failures of MPFA-PER and of PER"] == f"{means[0]:.1f}% and {means[1]:.1f}%"
+    for claim, odds in (
+        ("ratio of failures MPFA-PER / PER, 95 %", False),
+        ("ratio of the odds of failure, 95 %", True),
+    ):
+        ratio = bootstrapped(*failed, paired=True, odds=odds)
+        assert numbers(ours[claim])[0] == pytest.approx(ratio[0], abs=0.00501)
+        assert numbers(ours[claim])[1:] == pytest.approx(ratio[1:], abs=0.03)
+    _, low, high = numbers(ours["ratio of failures MPFA-PER / PER, 95 %"])
+    published = (100 - PUBLISHED["MPFA-PER"]) / (100 - PUBLISHED["PER"])
+    where = "inside" if low <= published <= high else "outside of"
+    assert f"The paper's ratio of failures lies {where} our interval." in whole_page()
+    left = ours["from PER's success to the ceiling of 100 % [points]"]
+    assert left == f"{100 - np.mean(b):.1f}"
+
+
 def test_difference_of_mpfa_per_and_per_is_that_of_the_rows() -> None:
     ours, (a, b) = claimed(), (success_of_methods()[name] for name in ("MPFA-PER", "PER"))
-    assert ours["success of MPFA-PER and of PER"] == f"{np.mean(a):.1f}% and {np.mean(b):.1f}%"
     gaps = [x - y for x, y in zip(a, b, strict=True)]
     gap, low, high, p = by_signs(gaps)
     interval = f"{gap:+.1f} [{low:+.1f}, {high:+.1f}], p = {p:.3f}"
-    assert ours["MPFA-PER − PER [points], 95 %, p"] == interval
+    assert ours["success, MPFA-PER − PER [points], 95 %, p"] == interval
     enough = int(ours["seeds that find one point with 80 % power, at a level of 5 %"])
     for seeds, found in ((enough, True), (enough - 1, False)):
         bound = stats.t.ppf(0.975, seeds - 1)
@@ -283,8 +346,8 @@ def test_spread_of_methods_and_of_their_runs_is_that_of_the_rows() -> None:
     share = 1 - 117 * variance / (129 * np.var(np.concatenate([*runs.values()]), ddof=1))
     words = "share of the variance that the method explains, and by chance alone, exploratory"
     assert ours[words] == f"{share:.1%} and {12 / 129:.1%}, p = {test.pvalue:.3f}"
-    page = " ".join((DOCS / "results/paper.md").read_text(encoding="utf-8").split())
-    assert f"The run decides success: {1 - share:.0%} of the variance lies between" in page
+    said = f"The run decides success: {1 - share:.0%} of the variance lies between"
+    assert said in whole_page()
     ranges = []
     for name in ("plain-{}-letter", "ddpg-{}"):
         every = [success(name.format(each)).values() for each in ("mpfa_per", "per", "uniform")]
@@ -297,16 +360,33 @@ def test_spread_of_methods_and_of_their_runs_is_that_of_the_rows() -> None:
 def test_order_of_methods_is_that_of_the_rows() -> None:
     ours = claimed()
     for table in ("Table 2", "Table 4"):
-        pairs = [(numbers(cells[3])[0], success(arm_of(cells[0]))) for cells in section(table)]
+        pairs = [(PUBLISHED[cells[0]], success(arm_of(cells[0]))) for cells in section(table)]
         tau, p = stats.kendalltau(
             [published for published, _ in pairs], [np.mean([*s.values()]) for _, s in pairs]
         )
-        claim = f"Kendall's rank correlation with the order of {table}, exploratory"
+        mark = "†" * (table == "Table 4")
+        claim = f"Kendall's rank correlation with the order of {table}{mark}, exploratory"
         assert ours[claim] == f"{tau:+.2f}, p = {p:.3f}"
-    better = [numbers(c[2])[0] > 0 and numbers(c[5])[0] < 0.05 for c in section("Neighbors")]
-    claim = "neighbors of which the paper's better one is better, corrected p < 0.05"
+    lines = list(section("Neighbors"))
+    better = [numbers(c[4])[0] > 0 and numbers(c[6])[0] < 0.05 for c in lines]
+    claim = "neighbors† of which the paper's better one is better; ours: corrected p < 0.05"
     assert ours[claim] == f"{sum(better)} of {len(better)}"
+    small = [numbers(c[3])[0] < numbers(c[7])[0] for c in lines]
+    claim = "neighbors† whose difference in the paper is below what we find with 80 % power"
+    assert ours[claim] == f"{sum(small)} of {len(small)}"
+    none = 1.0
+    for cells in lines:
+        a, b = (success(arm_of(name)) for name in cells[0].split(" − "))
+        gaps = [100 * (a[seed] - b[seed]) for seed in sorted(a)]
+        error, bound = np.std(gaps, ddof=1) / math.sqrt(10), stats.t.ppf(1 - 0.05 / 22, 9)
+        none *= 1 - stats.nct.sf(bound, 9, numbers(cells[3])[0] / error)
+    claim = "chance to find no neighbors† that differ, if the paper's differences are true"
+    assert ours[claim] == f"{none:.0%}"
+    assert f"with its differences the chance is {none:.0%}" in whole_page()
+    published = {c: paper for c, paper, _ in section("The paper's claims")}
+    claim = "neighbors† of which the paper's better one is better; ours: corrected p < 0.05"
+    assert published[claim] == f"{sum(numbers(c[3])[0] > 0 for c in lines)} of 11, untested"
     *others, own = (np.mean(steps(f"ddpg-{METHODS[c[0]]}")) for c in section("Table 3"))
     count = sum(each > own for each in others)
-    claim = "methods of Table 3 with more training steps than MPFA-PER, in the mean"
+    claim = "methods† of Table 3 with more training steps than MPFA-PER, in the mean"
     assert ours[claim] == f"{count} of 5"
