@@ -6,7 +6,7 @@ A run fails in a test that does not reach its goal, by a collision or by the tim
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -48,7 +48,7 @@ def ratio_interval(ours: Array, theirs: Array, *, paired: bool, odds: bool = Fal
         a, b = a / (1.0 - a), b / (1.0 - b)
     # A resample without failures has no ratio.
     ratios = np.divide(a, b, out=np.full_like(a, math.inf), where=b > 0.0)
-    low, high = np.quantile(ratios[:-1], (0.025, 0.975))
+    low, high = np.quantile(ratios[:-1], (0.025, 0.975), method="inverted_cdf")
     return Interval(float(ratios[-1]), float(low), float(high))
 
 
@@ -62,37 +62,49 @@ def question_left(rows: Rows) -> int:
     return len({job.name for job in question(rows.folder).jobs} - rows.runs)
 
 
+KINDS: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
+    "failures": lambda runs: 1.0 - runs["success"],
+    "collisions": lambda runs: runs["collision"],
+    "out of time": lambda runs: (1.0 - runs["success"] - runs["collision"]).abs().round(9),
+}
+"""Shares of each run's tests that count, by name."""
+
+
 def question_table(
     new: Mapping[str, pd.DataFrame], found: Mapping[str, pd.DataFrame]
 ) -> tuple[str, Interval, float]:
     """Return the table of the question, and its primary ratio with p, once all runs are made."""
-
-    def failures(measured: Mapping[str, pd.DataFrame], method: str) -> Array:
-        return 1.0 - measured[f"ddpg-{method}"]["success"].to_numpy(dtype=float)
-
     every = {
         f"ddpg-{name}": pd.concat([found[f"ddpg-{name}"], new[f"ddpg-{name}"]]) for name in CLAIMS
     }
-    lines, ratios, ps = [], [], []
-    for a, b in PAIRS:
-        ours, theirs = failures(new, a), failures(new, b)
-        ratios.append(ratio_interval(ours, theirs, paired=False))
-        ps.append(permutation_p(ours, theirs))
-    corrected = [ps[0], *holm(np.array(ps[1:]))]
-    for number, (a, b) in enumerate(PAIRS):
-        both = failures(every, a), failures(every, b)
-        whole = ratio_text(ratio_interval(*both, paired=False))
-        published = f"{PUBLISHED[a] / PUBLISHED[b]:.2f}" if b in PUBLISHED else ""
+
+    def shares(
+        measured: Mapping[str, pd.DataFrame], pair: tuple[str, str], kind: str
+    ) -> list[Array]:
+        return [KINDS[kind](measured[f"ddpg-{name}"]).to_numpy(dtype=float) for name in pair]
+
+    asked = [(pair, "failures") for pair in PAIRS]
+    asked += [(PAIRS[0], kind) for kind in ("collisions", "out of time")]
+    ps = [permutation_p(*shares(new, *what)) for what in asked]
+    corrected = [ps[0], *holm(np.array(ps[1 : len(PAIRS)]))]
+    lines = []
+    for number, (pair, kind) in enumerate(asked):
+        ours, whole = shares(new, pair, kind), shares(every, pair, kind)
+        known = all(name in PUBLISHED for name in pair) and kind != "out of time"
+        planned = number < len(PAIRS)
+        order = ("secondary" if number else "primary") if planned else "exploratory"
         lines.append(
             [
-                f"{NAMES[a]} / {NAMES[b]}, {'secondary' if number else 'primary'}",
-                published,
-                " and ".join(f"{failures(new, name).mean():.2%}" for name in (a, b)),
-                ratio_text(ratios[number]),
+                f"{NAMES[pair[0]]} / {NAMES[pair[1]]}, {kind}, {order}",
+                f"{PUBLISHED[pair[0]] / PUBLISHED[pair[1]]:.2f}" if known else "",
+                " and ".join(f"{runs.mean():.2%}" for runs in ours),
+                ratio_text(ratio_interval(*ours, paired=False)),
                 f"{ps[number]:.3f}",
-                f"{corrected[number]:.3f}",
-                f"{whole}, p = {permutation_p(*both):.3f}",
+                f"{corrected[number]:.3f}" if planned else "",
+                f"{ratio_text(ratio_interval(*whole, paired=False))}, "
+                f"p = {permutation_p(*whole):.3f}",
             ]
         )
-    head = ["", "paper", "failures", "ratio, 95 %", "p", "p corrected"]
-    return table([*head, "all 46 seeds, exploratory"], lines), ratios[0], ps[0]
+    head = ["", "paper", "shares of tests", "ratio, 95 %", "p", "p corrected"]
+    text = table([*head, "all 46 seeds, exploratory"], lines)
+    return text, ratio_interval(*shares(new, *asked[0]), paired=False), ps[0]

@@ -87,6 +87,6 @@ def in_order(rows: Mapping[str, Tested]) -> list[str]:
     return sorted(rows, key=lambda name: (-rows[name].success, rows[name].time))
 
 
-def neighbors() -> list[tuple[str, str]]:
-    """Return the pairs of neighbors in the order of Table 2, then of Table 4."""
-    return [pair for rows in (TABLE_2, TABLE_4) for pair in pairwise(in_order(rows))]
+def neighbors(*tables: Mapping[str, Tested]) -> list[tuple[str, str]]:
+    """Return the pairs of neighbors in the order of each table, by default of Tables 2 and 4."""
+    return [pair for rows in tables or (TABLE_2, TABLE_4) for pair in pairwise(in_order(rows))]

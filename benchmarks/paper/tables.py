@@ -218,6 +218,6 @@ def _points(value: float) -> str:
 def _name(arm: str) -> str:
     """Return the paper's name of an arm's method, with the arm's own name."""
     _, method, *rest = arm.split("-")
-    kind = {"letter": "to the letter", "one_robot": "one robot"}
+    kind = {"letter": "closer to the paper", "one_robot": "one robot"}
     words = [kind.get(each, each.replace("phi", "φ = ")) for each in rest]
     return ", ".join([NAMES[method], *words])

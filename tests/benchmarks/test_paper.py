@@ -162,9 +162,9 @@ def test_five_seeds_are_compared_by_their_means(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("gap", "sentences"),
     [
-        (0.05, ["MPFA-PER fails less often than PER", "lies inside our interval"]),
-        (0.0, ["was not seen to fail less often", "lies outside of our", "find one point"]),
-        (-0.05, ["MPFA-PER fails more often than PER", "lies outside of our interval"]),
+        (0.05, ["MPFA-PER fails less often than PER", "points lies inside our", "(2 of 11)"]),
+        (0.0, ["No step of", "was not established", "lies outside of our", "find one point"]),
+        (-0.05, ["No step of", "MPFA-PER fails more often", "lies outside of our interval"]),
     ],
 )
 def test_answers_say_where_the_ratio_of_the_paper_lies(
@@ -179,7 +179,7 @@ def test_answers_say_where_the_ratio_of_the_paper_lies(
     for sentence in sentences:
         assert sentence in text
     assert "with more training steps than MPFA-PER, in the mean', '5 of 5', '0 of 5')" in text
-    assert "The paper's order of the methods is not confirmed." in text
+    assert "of the paper's order of the methods† is confirmed." in text
 
 
 def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
@@ -189,8 +189,8 @@ def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
     arms = {f"ddpg-{name}": list(0.3 + 0.05 * i + noise) for i, name in enumerate(names)}
     rows = made_up(tmp_path, arms)
     made = answers(rows, measures(rows))[0]
-    assert made.said == "The paper's order of the methods is confirmed."
-    assert made.numbers[0][2] == "11 of 11"
+    assert made.said.startswith("Each step of the paper's order of the methods† is confirmed.")
+    assert [number[2] for number in made.numbers[:2]] == ["6 of 6", "5 of 5"]
 
 
 def asked(folder: Path, shares: dict[str, list[float]]) -> Rows:
@@ -223,9 +223,15 @@ def test_question_with_all_runs_compares_failures_of_new_seeds(tmp_path: Path) -
     said, table = question_text(rows, measures(made_up(tmp_path / "ten", ten)))
     assert "In 36 new seeds MPFA-PER fails 0.50 times as often as PER, and the planned" in said
     assert "test does find a difference, p = 0.000." in said
-    primary, second, third = table.splitlines()[2:]
-    assert primary.startswith("| MPFA-PER / PER, primary | 0.66 | 4.00% and 8.00% | 0.50 [0.4")
-    assert "| MPFA-PER / uniform, secondary |  | 4.00% and 8.00% | 0.50 [" in second
+    primary, second, third, collisions, late = table.splitlines()[2:]
+    start = "| MPFA-PER / PER, failures, primary | 0.66 | 4.00% and 8.00% | 0.50 [0.4"
+    assert primary.startswith(start)
+    assert "| MPFA-PER / uniform, failures, secondary |  | 4.00% and 8.00% | 0.50 [" in second
+    # Whatever fails in these rows collides.
+    assert collisions.replace("collisions, exploratory", "failures, primary").startswith(start)
+    assert (
+        "PER, out of time, exploratory |  | 0.00% and 0.00% | nan [nan, nan] | 1.000 |  |" in late
+    )
     assert "| 1.00 [" in third
     assert third.split("|")[5:7] == [" 1.000 ", " 1.000 "]
     # 46 runs: (36 x 4 + 10 x 5) / (36 x 8 + 10 x 5).
