@@ -21,11 +21,6 @@ Runs = dict[str, dict[str, Curve]]
 """Curves of the runs of a task, by method and seed."""
 
 
-def are_scores(path: Path) -> bool:
-    """Return True unless a path is the folder of a comparison of ``compare.py``."""
-    return path.is_file() or not (path / files.EPISODES).exists()
-
-
 def write_scores(paths: Sequence[Path], output: Path) -> str:
     """Write ``tables.md`` and ``curves.png``.
 
