@@ -58,7 +58,9 @@ from training.evaluating import (
     summary_row,
     tasks_of,
 )
+from training.finished import warnings_of
 from training.plugins import add_plugin
+from training.understood import understood
 from training.worlds import parse_worlds, world_name
 
 if TYPE_CHECKING:
@@ -328,6 +330,10 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     from training.records import as_table, write_table
 
     policy = options.loaded
+    print(understood(policy.env_arguments.get("robot", "turtlebot2"), options.worlds))
+    if options.path is not None and options.path.is_dir():
+        for sentence in warnings_of(options.path):
+            print(f"warning: {sentence}")
     driver: Drivable = filtered(policy, physics=options.physics) if options.filter else policy
     folder = options.output or output_folder(options)
     physics = options.physics
