@@ -36,15 +36,9 @@ from collections.abc import Sequence
 import training.extra  # noqa: F401
 
 # isort: split
-from torchrl_mpfa.checks import unknown
 from training import files
-from training.comparison.arms import check_free, parse_arms
-from training.comparison.execution import add_options, make_runs
-from training.comparison.jobs import TESTED, Comparison, Evaluation
-from training.environments import check_physics
+from training.comparison.options import EPISODES, WORLDS, add_options
 from training.plugins import add_plugin, with_plugin
-from training.settings.train import GROUPS, register
-from training.worlds import parse_worlds
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -62,10 +56,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             f"--{name}", nargs="+", type=kind, default=default, help=f"{text} (default: {shown})"
         )
     add_options(parser, folder="runs/compare", what="runs")
-    parser.add_argument("--worlds", nargs="+", default=TESTED.words, help="(default: test)")
-    parser.add_argument(
-        "--episodes", type=int, default=TESTED.episodes, help="for each (default: 200)"
-    )
+    parser.add_argument("--worlds", nargs="+", default=WORLDS, help="(default: test)")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="for each (default: 200)")
     parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
     parser.add_argument(
         "--filter",
@@ -83,14 +75,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--anew", action="store_true", help="train runs with other settings again")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
+    # Imported here, and below, as they take seconds: what is misspelt is answered before.
+    from training.comparison.arms import check_free, parse_arms
+
     try:
         options.overrides, options.plugin = with_plugin(options.overrides, options.plugin)
         check_free(options.overrides)
         options.arms = parse_arms(options.arm)
-        check_physics(options.physics or "kinematic")
         files.check_folder(options.folder)
     except ValueError as error:
         parser.error(str(error))
+    from torchrl_mpfa.checks import unknown
+    from training.settings.train import GROUPS
+
     for group in ("method", "learner", "seed"):
         names = getattr(options, f"{group}s")
         for number, name in enumerate(names):
@@ -102,6 +99,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(options, option)
         if value is not None and value < 1:
             parser.error(f"--{option} must be at least 1, got {value}")
+    from training.evaluating import check_physics
+    from training.worlds import parse_worlds
+
+    try:
+        check_physics(options.physics or "kinematic")
+    except ValueError as error:
+        parser.error(str(error))
     try:
         parse_worlds(options.worlds)
     except (ValueError, OSError) as error:
@@ -120,6 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal that stopped it.
     """
     options = parse(arguments)
+    from training.comparison.execution import make_runs
+    from training.comparison.jobs import Comparison, Evaluation
+    from training.settings.train import register
+
     register()
     if options.ray is not None:
         # The other machines know it by this name.

@@ -28,13 +28,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import training.extra  # noqa: F401
 
 # isort: split
-import pandas as pd
-
 from mpfa_envs import (
     GENERATORS,
     PLANNERS,
@@ -44,16 +42,14 @@ from mpfa_envs import (
     load_policy,
     make_planner,
 )
-from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE
-from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.environments import check_physics
 from training.evaluating import (
     Drivable,
     add_robot,
+    check_physics,
     drive,
     evaluation_folder,
     filtered,
@@ -62,13 +58,15 @@ from training.evaluating import (
     summary_row,
     tasks_of,
 )
-from training.live import watch
-from training.pictures import TRAJECTORIES, Values, write_pictures
+from training.finished import warnings_of
 from training.plugins import add_plugin
-from training.records import as_table, write_table
-from training.run.tracking import log_evaluation
-from training.run.values import load_learner, values_of
+from training.understood import understood
 from training.worlds import parse_worlds, world_name
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from training.pictures import Values
 
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
@@ -261,6 +259,8 @@ def critic(options: argparse.Namespace) -> Values | None:
     """Return the values of the critic of a run, if there is a run."""
     if options.path is None or not (options.path / files.CHECKPOINT).exists():
         return None
+    from training.run.values import load_learner, values_of
+
     try:
         learner, settings = load_learner(options.path, options.loaded)
     except ValueError as error:
@@ -273,6 +273,10 @@ def show_live(
     driver: Drivable, options: argparse.Namespace, how: Mapping[str, Any]
 ) -> pd.DataFrame:
     """Show the episodes in a window, one after another; return how each ended."""
+    import pandas as pd
+
+    from training.live import watch
+
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)
     for end in watch(driver, tasks, **how):
@@ -294,6 +298,9 @@ def held(folder: Path) -> Iterator[None]:
 
 def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> Iterator[str]:
     """Log the evaluation to the wandb run of the training; yield lines that say so."""
+    from training.pictures import TRAJECTORIES
+    from training.run.tracking import log_evaluation
+
     name, steps = folder.name.removeprefix("evaluation-"), policy.card.get("steps", 0)
     try:
         found = log_evaluation(run, name, summary, actions=steps, picture=folder / TRAJECTORIES)
@@ -314,7 +321,19 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         A row for each world, and the total.
     """
     options = parse(arguments)
+    # Imported here as they take seconds: what is misspelt is answered before.
+    import pandas as pd
+
+    from mpfa_envs.evaluation.results import EpisodeResult
+    from torchrl_mpfa.saving import write_text_atomically
+    from training.pictures import write_pictures
+    from training.records import as_table, write_table
+
     policy = options.loaded
+    print(understood(policy.env_arguments.get("robot", "turtlebot2"), options.worlds))
+    if options.path is not None and options.path.is_dir():
+        for sentence in warnings_of(options.path):
+            print(f"warning: {sentence}")
     driver: Drivable = filtered(policy, physics=options.physics) if options.filter else policy
     folder = options.output or output_folder(options)
     physics = options.physics

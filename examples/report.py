@@ -26,8 +26,7 @@ from pathlib import Path
 import training.extra  # noqa: F401
 
 # isort: split
-from training.comparison.report import write_report
-from training.comparison.scores import CURVES, are_scores, write_scores
+from training.files import are_scores
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,6 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("comparisons and tables of scores have reports of their own: name one kind")
     first = options.paths[0]
     output = options.output or (first.parent if first.is_file() else first)
+    # Imported here as they take seconds: what is misspelt is answered before.
+    from training.comparison.report import write_report
+    from training.comparison.scores import CURVES, write_scores
+
     write = write_scores if kinds == {True} else write_report
     try:
         print(write(options.paths, output))

@@ -25,6 +25,7 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training.finished import after_the_end, is_finished
+from training.plugins import with_plugin
 
 
 def main() -> None:
@@ -43,7 +44,19 @@ def main() -> None:
     if len(arguments) == 1 and not only and is_finished(Path(folder)):
         print(after_the_end(Path(folder)))
         raise SystemExit(0)
-    # Imports PyTorch, Hydra and wandb, which takes seconds.
+    # The parts of a run take seconds to import: what is misspelt is answered before.
+    from training.settings.command_line import parse_overrides, read_settings
+    from training.settings.train import register
+
+    try:
+        settings, _ = with_plugin(arguments)
+        register()
+        parse_overrides(settings)
+        if not any(word.startswith("resume=") for word in settings):
+            next(read_settings(settings), None)
+    except ValueError as error:
+        print(f"train.py: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
     from training.run.script import train
 
     train(arguments)

@@ -37,9 +37,8 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training import files
-from training.comparison.execution import add_options
+from training.comparison.options import add_options
 from training.plugins import add_plugin, with_plugin
-from training.settings.train import register
 
 RANGES = Path(__file__).with_suffix(".yaml")
 FIRST_SEED = 3000
@@ -82,12 +81,17 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             parser.error(f"--seeds has {seed} twice")
     if find_spec("optuna") is None:
         parser.error("it needs Optuna: install the extra 'tune', see Install in the README")
-    # Imports Optuna, an extra of its own.
-    from training.comparison.ranges import read_ranges
+    # Imported here, and below, as they take seconds: what is misspelt is answered before.
+    from training.settings.command_line import parse_overrides
+    from training.settings.train import register
 
     try:
         options.settings, _ = with_plugin(options.settings, options.plugin)
         register()
+        parse_overrides(options.settings)
+        # Imports Optuna, an extra of its own.
+        from training.comparison.ranges import read_ranges
+
         files.check_folder(options.folder)
         options.searched = read_ranges(options.ranges, options.settings)
     except ValueError as error:

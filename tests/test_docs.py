@@ -164,7 +164,7 @@ TASK_PAGES = [
     "worlds.md",
 ]
 ELSEWHERE = [
-    *("methods/README.md", "methods/her.md"),
+    *("methods/README.md", "methods/her.md", "metrics.md"),
     *("torchrl_trainer.md", "results/values.md", "tuning.md"),
 ]
 """Pages whose code is run by the tests of what they are about."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from operator import index
 from typing import Any, Final, get_args
@@ -13,8 +13,59 @@ MOST: Final = 100_000
 once, and a typing error must not take all time or memory."""
 
 
+_SLIPS: Final[Mapping[str, Mapping[str, float]]] = {
+    "m": {"millimeters": 1e-3, "centimeters": 1e-2},
+    "m/s": {"mm/s": 1e-3, "cm/s": 1e-2},
+    "m/s²": {"mm/s²": 1e-3, "cm/s²": 1e-2},
+    "rad": {"degrees": math.pi / 180.0},
+    "rad/s": {"deg/s": math.pi / 180.0},
+    "deg": {"radians": 180.0 / math.pi},
+    "kg": {"grams": 1e-3},
+    "s": {"milliseconds": 1e-3},
+}
+"""Units that are taken for others, and their size in these."""
+MEANT: Final[Mapping[str, tuple[float, float, str]]] = {
+    **dict.fromkeys(("radius", "height", "wheel_base"), (0.01, 5.0, "m")),
+    "wheel_radius": (0.001, 2.0, "m"),
+    "mass": (0.01, 2000.0, "kg"),
+    **dict.fromkeys(("min_wheel_speed", "max_wheel_speed"), (1e-3, 20.0, "m/s")),
+    "speeds": (0.0, 20.0, "m/s and rad/s"),
+    **dict.fromkeys(("wheel_acceleration", "acceleration"), (1e-3, 100.0, "m/s²")),
+    "turn_limit": (0.01, 20.0, "rad/s"),
+    "field_of_view": (7.0, 360.0, "deg"),
+    **dict.fromkeys(("lidar_range", "max_range"), (0.1, 300.0, "m")),
+    "offset": (0.0, 5.0, "m"),
+    "yaw": (0.0, 2.0 * math.pi, "rad"),
+    **dict.fromkeys(("clearance", "stop_distance"), (0.0, 5.0, "m")),
+    "range_noise": (0.0, 1.0, "m"),
+    "goal_radius": (0.01, 20.0, "m"),
+    **dict.fromkeys(("closeness_distance", "look_ahead"), (0.01, 20.0, "m")),
+    **dict.fromkeys(("unseen", "min_goal_distance", "max_goal_distance"), (0.01, 1000.0, "m")),
+    "map_size": (1.0, 1000.0, "m"),
+    **dict.fromkeys(("time_step", "check_period"), (1e-4, 10.0, "s")),
+    **dict.fromkeys(("scan_timeout", "odometry_timeout", "command_timeout"), (1e-3, 60.0, "s")),
+}
+"""Least and greatest size that a number can be meant to have, wherever it is given, and its unit;
+zero is for other checks."""
+
+
+def check_meant(name: str, value: float, quantity: str = "") -> None:
+    """Reject a number of a size that nobody means, as in another unit."""
+    least, most, unit = MEANT.get(quantity or name.rpartition(".")[2], (0.0, math.inf, ""))
+    if not value or least <= abs(value) <= most:
+        return
+    guesses = [(value * factor, other) for other, factor in _SLIPS.get(unit, {}).items()]
+    within = [each for each in guesses if least <= abs(each[0]) <= most]
+    hint, middle = "", math.sqrt(max(least, 1e-3) * most)
+    if within:
+        meant, other = min(within, key=lambda each: abs(math.log(abs(each[0]) / middle)))
+        hint = f"; did you mean {meant:.4g}, which is {value:g} {other}?"
+    bound = f"at least {least:.4g}" if abs(value) < least else f"at most {most:.4g}"
+    raise ValueError(f"{name} must be {bound} {unit} in size, got {value:g}{hint}")
+
+
 def check_number(name: str, value: Any) -> float:
-    """A finite number."""
+    """A finite number, of a size that can be meant."""
     if isinstance(value, (bool, str, bytes)):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
     try:
@@ -23,6 +74,7 @@ def check_number(name: str, value: Any) -> float:
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
+    check_meant(name, number)
     return number
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Callable
@@ -18,6 +19,11 @@ def read_file(path: Path, most: int) -> bytes:
     if len(content) > most:
         raise OSError(f"it has more than {most} bytes")
     return content
+
+
+def cause_of(error: Exception) -> str:
+    """Return in one line what a foreign reader says, without the addresses of its objects."""
+    return " ".join(re.sub(r"<[^<>]* at 0x[0-9A-Fa-f]+>", "", str(error)).split())
 
 
 def check_replaceable(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -30,15 +29,6 @@ from training.settings.train import TrainSettings
 _DISTANCE = 0.14
 """Farthest that a robot drives in an action [m], unless it is faster than that in 0.2 s."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
-
-
-def check_physics(physics: str) -> None:
-    """Raise for simulated wheels if there is no PyBullet."""
-    if physics == "wheels":
-        try:
-            import_module("mpfa_envs.robots.simulation")
-        except ImportError as error:
-            raise ValueError(str(error)) from error
 
 
 def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:

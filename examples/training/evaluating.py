@@ -6,6 +6,7 @@ from argparse import ArgumentParser
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from itertools import accumulate
 from typing import Any
 
@@ -43,6 +44,15 @@ class Drives:
     def of_world(self, name: str) -> list[int]:
         """Return the numbers of the episodes in one world."""
         return [n for n, each in enumerate(self.tasks) if each.world.name == name]
+
+
+def check_physics(physics: str) -> None:
+    """Raise for simulated wheels if there is no PyBullet."""
+    if physics == "wheels":
+        try:
+            import_module("mpfa_envs.robots.simulation")
+        except ImportError as error:
+            raise ValueError(str(error)) from error
 
 
 def evaluation_folder(

@@ -44,6 +44,11 @@ def digest_of(plugin: str | None) -> str | None:
     return None if plugin is None else digest(Path(plugin))
 
 
+def are_scores(path: Path) -> bool:
+    """Return True unless a path is the folder of a comparison of ``compare.py``."""
+    return path.is_file() or not (path / EPISODES).exists()
+
+
 def check_folder(folder: Path) -> None:
     """Raise if a folder cannot be made or written in."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())

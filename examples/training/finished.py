@@ -34,6 +34,26 @@ def after_the_end(folder: Path) -> str:
     )
 
 
+def nothing_learned(actions: int, rows: int | None = None) -> str:
+    """Return one sentence on a run that was too short to learn from."""
+    needs = "" if rows is None else f", as the first update needs {rows}"
+    return (
+        f"nothing was learned: no update was made in {actions:,} actions{needs}; give more actions"
+    )
+
+
+def warnings_of(folder: Path) -> list[str]:
+    """Return sentences on the run of a policy that is not finished, or has learned nothing."""
+    status = read_json(folder / files.STATUS)
+    said = []
+    if status.get("finished") is False and "total" in status:
+        done, total = status["done"], status["total"]
+        said.append(f"{folder} is not finished: {done:,} of {total:,} {status['unit']}s")
+    if status.get("updates") == 0:
+        said.append(nothing_learned(status["steps"]))
+    return said
+
+
 def read_json(path: Path) -> Mapping[str, Any]:
     """Read a JSON file of a run; empty if there is none."""
     try:

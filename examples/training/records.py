@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,6 +93,31 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
     write_text_atomically(table.to_csv(index=False), path)
 
 
+def checked_words(rows: pd.DataFrame, names: Sequence[str], path: Path) -> None:
+    """Raise for an empty cell in columns that name something, by its line."""
+    for name in names:
+        empty = rows[name].isna() | (rows[name].astype(str).str.strip() == "")
+        if empty.any():
+            line = rows.index[empty.to_numpy()][0] + 2
+            raise ValueError(f"{path}:{line}: {name} must not be empty")
+
+
+def checked_numbers(rows: pd.DataFrame, name: str, path: Path) -> pd.Series[Any]:
+    """Return a column as numbers, True as 1; raise for what is none, or not finite, by its line."""
+    import pandas as pd
+
+    flags = {"true": 1.0, "false": 0.0}
+    words = rows[name].map(lambda cell: flags.get(str(cell).strip().lower(), cell))
+    values = pd.to_numeric(words, errors="coerce").astype(float)
+    wrong = ~np.isfinite(values.to_numpy())
+    if wrong.any():
+        cell = rows[name].to_numpy()[wrong][0]
+        got = "an empty cell" if pd.isna(cell) or not str(cell).strip() else repr(str(cell))
+        line = rows.index[wrong][0] + 2
+        raise ValueError(f"{path}:{line}: {name} must be a finite number, got {got}")
+    return values
+
+
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table; one without rows if there is no such file."""
     import pandas as pd
@@ -99,7 +125,38 @@ def read_table(path: Path) -> pd.DataFrame:
     if not path.exists():
         return pd.DataFrame()
     # An arm may be called 3 or None: only an empty cell has no value.
-    try:
+    with _readable(path):
         return pd.read_csv(path, dtype={"arm": str}, keep_default_na=False, na_values=[""])
+
+
+def read_words(path: Path) -> pd.DataFrame:
+    """Read a table of any script as text; the row of line N has the index N - 2."""
+    import pandas as pd
+
+    with _readable(path):
+        head = path.read_text(encoding="utf-8-sig").partition("\n")[0]
+        separator = max(",;\t", key=head.count)
+        rows = pd.read_csv(
+            path,
+            sep=separator,
+            dtype=str,
+            encoding="utf-8-sig",
+            keep_default_na=False,
+            na_values=[""],
+            skip_blank_lines=False,
+            skipinitialspace=True,
+            index_col=False,
+        )
+    return rows.rename(columns=str.strip).dropna(how="all")
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Name the file in errors about what is no table."""
+    import pandas as pd
+
+    try:
+        yield
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is damaged, its rows cannot be read: remove it") from error
+        why = " ".join(str(error).split())
+        raise ValueError(f"{path} is damaged, its rows cannot be read: {why}") from error

@@ -15,7 +15,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import mpfa_envs
 from mpfa_envs import ROBOTS, NavigationEnv, RobotModel, TaskConfig
-from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
+from mpfa_envs.deploy import Card, CardError, Pilot, Scan, ScanError, read_exported
 from mpfa_envs.robots.drives import KinematicDrives
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.exported import card, exported
@@ -342,3 +342,41 @@ def test_a_network_of_another_size_is_rejected(tmp_path: Path) -> None:
         Network(b"nothing", 24, 2)
     with pytest.raises(CardError, match="the card has no 'format'"):
         Card.of({})
+
+
+def in_place(card: Card, slowest: float) -> Pilot:
+    """A pilot of a robot that sees 80 degrees and is ordered to turn."""
+    robot = replace(card.robot, min_wheel_speed=slowest)
+    turn = np.array([[1.0, 0.2]], np.float32)
+    return Pilot(replace(card, robot=robot), lambda _: turn, unseen=0.3)
+
+
+@pytest.mark.parametrize("slowest", [0.0, 0.05])
+def test_a_wheel_is_not_ordered_below_its_least_speed(slowest: float) -> None:
+    pilot = in_place(card(), slowest)
+    pilot.begin((3.0, 1.0))
+    scan = Scan(-math.radians(40.0), math.radians(1.0), np.full(81, 3.0), 0.1, 5.0)
+    with pytest.raises(ScanError, match="it cannot turn on the spot"):
+        pilot.decide(scan, (0.0, 0.0, 0.0), (0.1, 0.0))
+    able = in_place(card(), -0.5)
+    able.begin((3.0, 1.0))
+    command = able.decide(scan, (0.0, 0.0, 0.0), (0.1, 0.0))
+    assert command.linear == 0.0 and command.left == -command.right
+
+
+@pytest.mark.parametrize(
+    ("pose", "speeds", "text"),
+    [
+        ((2000.0, 1500.0, 0.0), (0.3, 0.0), "goal must be on the map, 2000 m around"),
+        ((0.0, 0.0, 0.0), (300.0, 0.0), "speeds must be at most 20 m/s and rad/s in size, got 300"),
+        ((0.0, 0.0, 0.0), (0.1, 80.0), "speeds must be at most 20 m/s and rad/s in size, got 80"),
+    ],
+)
+def test_odometry_in_another_unit_is_rejected(
+    pose: tuple[float, float, float], speeds: tuple[float, float], text: str
+) -> None:
+    pilot = in_place(card(), -0.5)
+    pilot.begin((3.0, 1.0))
+    scan = Scan(-math.pi, math.pi / 180, np.full(360, 3.0))
+    with pytest.raises(ValueError, match=text):
+        pilot.decide(scan, pose, speeds)

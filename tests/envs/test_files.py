@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from mpfa_envs import (
     save_world,
 )
 from mpfa_envs.deploy.card import CardError, read_exported
+from mpfa_envs.files import cause_of
 from mpfa_envs.policies.layers import Linear
 from mpfa_envs.policies.policy import PolicyFileError
 from mpfa_envs.worlds.gazebo import load_gazebo_world
@@ -93,3 +95,31 @@ def test_a_link_to_nothing_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "policy.npz").symlink_to(tmp_path / "later")
     with pytest.raises(FileExistsError, match="path must be free or hold a policy"):
         save_policy(POLICY, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"junk", b"P5 10 10 255\n", b"PK\x03\x04junk", b"\x93NUMPY"]
+)
+@pytest.mark.parametrize(
+    ("name", "load"),
+    [
+        ("map.pgm", map_of),
+        ("room.world", load_gazebo_world),
+        ("room.world.gz", load_gazebo_world),
+        ("world.yaml", load_world),
+        ("policy.npz", load_policy),
+        ("policy.onnx", load_policy),
+    ],
+)
+def test_a_message_has_no_address_of_an_object(
+    tmp_path: Path, name: str, load: Callable[[Path], object], content: bytes
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        load(tmp_path / name)
+    assert not re.search(r" at 0x|\n", str(caught.value))
+
+
+def test_the_cause_of_an_error_is_kept_without_the_objects_in_it() -> None:
+    error = ValueError("cannot read <a.B object at 0x7f> of <open file 'x' at 0xAB> here")
+    assert cause_of(error) == "cannot read of here"

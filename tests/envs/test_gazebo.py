@@ -370,3 +370,24 @@ def test_marks_without_an_end_are_rejected_soon(text, tmp_path):
     with pytest.raises(WorldFileError, match="is not XML"):
         load_gazebo_world(tmp_path / "a.world")
     assert time.process_time() - start < 2.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '# a yard\ninclude "cart.inc"\nfloorplan\n(\n  bitmap "yard.png"\n)\n',
+        "define block model\n(\n  size [1 1 1]\n)\n",
+        "window ( size [600 600] )\nposition(pose [0 0 0 0])\n",
+    ],
+)
+def test_a_world_of_stage_is_called_by_name(tmp_path, text):
+    (tmp_path / "yard.world").write_text(text)
+    with pytest.raises(WorldFileError, match=r"is a world of Stage, .* as a ROS map"):
+        resolve_world(tmp_path / "yard.world")
+
+
+@pytest.mark.parametrize("text", ["plain text", "(", "<sdf>(</sdf", "a: (b)"])
+def test_other_text_is_not_taken_for_a_world_of_stage(tmp_path, text):
+    (tmp_path / "yard.world").write_text(text)
+    with pytest.raises(WorldFileError, match="is not XML"):
+        resolve_world(tmp_path / "yard.world")

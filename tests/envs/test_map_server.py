@@ -39,6 +39,17 @@ def test_opacity_is_averaged_in_as_by_map_server_but_gray_of_map_saver_stays_unk
     assert found.tolist() == [True, True, False, True]
 
 
+@pytest.mark.parametrize("opacity", [1, 128, 254])
+@pytest.mark.parametrize("shade", [0, 255])
+def test_a_pixel_that_is_not_wholly_opaque_is_unknown_in_mode_scale(shade, opacity, tmp_path):
+    pixels = np.full((3, 4, 4), 255, dtype=np.uint8)
+    pixels[1, 1] = [shade] * 3 + [opacity]
+    Image.fromarray(pixels).save(tmp_path / "map.png")
+    path = write_map(tmp_path, None, image="map.png", mode="scale")
+    assert np.argwhere(load_world(path).occupancy.occupied).tolist() == [[1, 1]]
+    assert not World.from_map(path, unknown="free").occupancy.occupied.any()
+
+
 TRUTH = np.zeros((4, 3), dtype=bool)
 
 

@@ -158,7 +158,7 @@ NOISE: Rows = [
 LIDAR: Rows = [
     ({"field_of_view": 0.0}, "field_of_view must be positive, got 0.0"),
     ({"field_of_view": -90.0}, "field_of_view must be positive, got -90.0"),
-    ({"field_of_view": 361.0}, "field_of_view must be at most 360 degrees, got 361.0"),
+    ({"field_of_view": 361.0}, "field_of_view must be at most 360 deg in size, got 361"),
     ({"field_of_view": math.nan}, "field_of_view must be a finite number, got nan"),
 ]
 PAIRS: Rows = [

@@ -80,7 +80,7 @@ def test_a_robot_comes_back_from_its_file_and_its_fields(robot: RobotModel, tmp_
         ("turn_limit: null", "turn_limit must be a number in rad/s, got 'null'"),
         ("wheel_base: 0.9", "wheel_base must be at most the diameter 0.56, got 0.9"),
         ("min_wheel_speed: 2", "min_wheel_speed must be below max_wheel_speed = 0.9, got 2.0"),
-        ("field_of_view: 400", "field_of_view must be at most 360 degrees, got 400.0"),
+        ("field_of_view: 400", "field_of_view must be at most 360 deg in size, got 400"),
         ("lidar_rays: 10.5", "lidar_rays must be a positive integer, got 10.5"),
         ("lidar_range: 0", "lidar_range must be positive, got 0.0"),
         ("lidar_mount: 3", "lidar_mount must be a list"),

@@ -259,3 +259,38 @@ def test_a_scan_has_as_many_ranges_as_its_angles_say(count: int, off: int) -> No
 def test_a_scan_that_says_nothing_is_rejected(scan: Scan, message: str, silent: str) -> None:
     with pytest.raises(ScanError, match=message):
         Sectors(card(), silent=silent).read(scan)
+
+
+ROOM = np.linspace(0.3, 7.9, 360)
+"""Ranges of a room [m]."""
+
+
+@pytest.mark.parametrize("scale", [1000.0, 100.0])
+@pytest.mark.parametrize("limits", [(0.1, 8.0), (0.1, math.inf)])
+@pytest.mark.parametrize("scales", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+def test_a_scan_in_another_unit_is_rejected(
+    scale: float, limits: tuple[float, float], scales: tuple[float, float]
+) -> None:
+    ranges, end = scale ** scales[0] * ROOM, scale ** scales[1] * limits[1]
+    scan = Scan(-math.pi, math.pi / 180, ranges, limits[0], end)
+    if scales[0] == 0.0 and math.isinf(end):
+        Sectors(card()).read(scan)  # Nothing of it is in another unit.
+        return
+    with pytest.raises(ScanError, match="ranges and range_max must be in meters"):
+        Sectors(card()).read(scan)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "end"),
+    [
+        (np.full(360, 65535.0), 25.0),
+        (np.full(360, math.inf), math.inf),
+        (np.where(ROOM > 4.0, 65535.0, ROOM), 25.0),
+        (30.0 + ROOM, 100.0),
+        (ROOM, float(np.finfo(np.float32).max)),
+    ],
+)
+def test_a_scan_of_a_wide_hall_or_with_a_number_for_nothing_is_read(
+    ranges: np.ndarray, end: float
+) -> None:
+    Sectors(card()).read(Scan(-math.pi, math.pi / 180, ranges, 0.1, end))

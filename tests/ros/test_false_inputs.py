@@ -305,6 +305,23 @@ def test_a_scan_of_several_turns_stops_it(sees: Sees) -> None:
     assert loop.stands
 
 
+def millimeters(scan: Scan, _: float) -> Scan:
+    return scan._replace(ranges=1000.0 * np.asarray(scan.ranges))
+
+
+def limits_too(scan: Scan, time: float) -> Scan:
+    limits = 1000.0 * scan.range_min, 1000.0 * scan.range_max
+    return millimeters(scan, time)._replace(range_min=limits[0], range_max=limits[1])
+
+
+@pytest.mark.parametrize("sees", [millimeters, limits_too])
+def test_a_scan_in_millimeters_stops_it(sees: Sees) -> None:
+    loop = Loop()
+    order = loop.run(0.5, sees)
+    assert order is not None and order.reason.startswith("ranges and range_max must be in meters")
+    assert loop.stands
+
+
 def still_wheels(slowest: float = 0.0) -> Any:
     """A TurtleBot2 whose wheels can stand, or turn backwards."""
     return replace(ROBOTS["turtlebot2"], min_wheel_speed=slowest)

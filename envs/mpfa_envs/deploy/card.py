@@ -124,8 +124,6 @@ class Card:
                 for field, (entry, read) in _ENTRIES.items()
             }
         )
-        if card.field_of_view > 360.0:
-            raise ValueError(f"lidar.field_of_view must be at most 360, got {card.field_of_view}")
         if card.action_size != 2:
             raise ValueError(f"action.size must be 2, a left and a right wheel: {card.action_size}")
         memory: Any = card.memory

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.deploy.card import CardError
+from mpfa_envs.files import cause_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +48,8 @@ class Network:
             )
         # The runtime's errors have no base class of their own.
         except Exception as error:
-            raise CardError(f"the file holds no network that onnxruntime runs: {error}") from error
+            cause = cause_of(error)
+            raise CardError(f"the file holds no network that onnxruntime runs: {cause}") from error
         ends = [
             [(end.type, *end.shape[1:]) for end in ends]
             for ends in (self._session.get_inputs(), self._session.get_outputs())

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_positive, check_share
+from mpfa_envs.checks import MEANT, check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
-from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
+from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
@@ -36,6 +36,8 @@ _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
+_LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
+"""Side of the square around a robot in which its goal must be, without a map, too [m]."""
 _BEYOND: Final = 0.02
 """Share of its speed range by which a wheel's command may exceed it."""
 
@@ -289,6 +291,9 @@ class Pilot:
 
         Returns:
             The speeds.
+
+        Raises:
+            ScanError: Also if it would drive where it does not see and cannot turn on the spot.
         """
         observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
         blind, hidden = self.sectors.blind(scan)
@@ -309,6 +314,11 @@ class Pilot:
         linear = self.pace * 0.5 * (left + right)
         angular = self.pace * (right - left) / learned.wheel_base
         turn = 0.5 * angular * self.robot.wheel_base
+        if linear - abs(turn) < self.robot.min_wheel_speed - _tolerance(self.robot):
+            raise ScanError(
+                "the scan must reach 45 degrees to both sides of where the robot drives, as with "
+                f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
+            )
         return Command(linear - turn, linear + turn, linear, angular)
 
     def ramp(
@@ -363,12 +373,13 @@ class Pilot:
         )
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
-        """Reject a goal beyond the map, once its center is known."""
-        if self._map is None or center is None:
+        """Reject a goal beyond the map, once its center is known, or one in another unit."""
+        if center is None:
             return
-        if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * self._map_size:
+        side, name = (_LARGEST_MAP, "") if self._map is None else (self._map_size, " (map_size)")
+        if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * side:
             raise ValueError(
-                f"goal must be on the map, {self._map_size:g} m (map_size) around "
+                f"goal must be on the map, {side:g} m{name} around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_choice, check_positive
+from mpfa_envs.checks import MEANT, check_choice, check_positive
 from mpfa_envs.robots.model import check_mount
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ _AROUND = np.radians(np.arange(-177.5, 180.0, 5.0))
 """Directions in which a scan is asked for rays [rad]."""
 _SUDDEN = 0.8
 """What is nearer than this share of the greatest range does not leave it from scan to scan."""
+_FARTHEST = MEANT["max_range"][1], 1e5
+"""No planar lidar sees farther than the first [m]; drivers that write infinity as a number write
+more than the second."""
 _TURNS = 1.05
 """Turns that the rays may cover: those of some drivers overlap a little."""
 
@@ -226,6 +229,15 @@ class Sectors:
             raise ScanError(
                 f"the rays of a scan must go round once at most, got {ranges.size} in steps of "
                 f"{step} rad"
+            )
+        met = ranges[np.isfinite(ranges) & (ranges > 0.0)]
+        # Driven by, millimeters would be a hall wider than the lidar sees.
+        nearest, farthest = (met.min(), met.max()) if met.size else (0.0, 0.0)
+        beyond = self.card.max_range < nearest < farthest and farthest > _FARTHEST[0]
+        if beyond or _FARTHEST[0] < most <= _FARTHEST[1]:
+            raise ScanError(
+                f"ranges and range_max must be in meters, as the lidar's {self.card.max_range:g} m "
+                f"are, got {nearest:g} to {farthest:g} and {most:g}: millimeters or centimeters?"
             )
         last = start + step * (ranges.size - 1)
         if scan.angle_max is not None and not abs(scan.angle_max - last) <= _OFF * abs(step):

@@ -105,6 +105,14 @@ class FreeGrid:
         parts, _ = label(self.free, np.ones((3, 3)))
         return np.asarray(parts, dtype=np.int32)
 
+    def __str__(self) -> str:
+        """Return its size and how much of it is free, for errors."""
+        width, depth = self.world.size
+        return (
+            f"a room of {width:.4g} x {depth:.4g} m, of whose cells {self.free.mean():.1%} are "
+            f"{self.distance:g} m from obstacles and walls"
+        )
+
     def index(self, x: float, y: float) -> tuple[int, int]:
         """Column and row of a position's cell [m], the nearest one for a position outside."""
         places = zip((x, y), self.origin, self.free.shape, strict=True)

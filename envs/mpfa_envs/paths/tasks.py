@@ -113,8 +113,7 @@ def sample_task_on_grid(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a path of at most {longest} m between them that keeps "
-        f"{grid.distance} m"
+        f"{min_goal_distance} m apart with a path of at most {longest} m between them, in {grid}"
     )
 
 

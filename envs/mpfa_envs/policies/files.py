@@ -14,7 +14,7 @@ import numpy as np
 
 from mpfa_envs.deploy.card import CardError, read_exported
 from mpfa_envs.deploy.network import Network
-from mpfa_envs.files import check_replaceable, read_file, write_atomically
+from mpfa_envs.files import cause_of, check_replaceable, read_file, write_atomically
 from mpfa_envs.policies.layers import KINDS, arrays_of
 from mpfa_envs.policies.policy import Policy, PolicyFileError
 
@@ -123,7 +123,8 @@ def _load(file: Path) -> Policy:
         raise FileNotFoundError(message) from None
     # A damaged archive raises many errors: a wrong checksum, header, length, number, password.
     except Exception as error:
-        raise PolicyFileError(f"{file} holds no policy, or is damaged: {error}") from error
+        cause = cause_of(error)
+        raise PolicyFileError(f"{file} holds no policy, or is damaged: {cause}") from error
 
 
 def _read(content: bytes) -> Policy:

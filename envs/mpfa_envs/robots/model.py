@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean
+from mpfa_envs.checks import check_count, check_meant, check_number, check_positive, did_you_mean
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ PAPER_CLEARANCE: Final = 0.17
 A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
 """
 
+_CHECKED: Final = ("lidar_rays", "lidar_mount")
+"""Fields with checks of their own."""
 _LEVEL: Final = math.radians(10.0)
 """Greatest roll of a lidar that counts as level [rad]."""
 
@@ -92,9 +94,7 @@ class RobotModel:
             check_count("lidar_rays", self.lidar_rays)
         for field in fields(self)[1:]:
             value = getattr(self, field.name)
-            if field.name in ("lidar_rays", "lidar_mount"):
-                continue
-            if value is None and field.name in ("wheel_acceleration", "turn_limit"):
+            if field.name in _CHECKED or (value is None and field.default is None):
                 continue
             if not isinstance(value, (int, float)):
                 raise ValueError(f"{field.name} must be a finite number, got {value!r}")
@@ -113,8 +113,6 @@ class RobotModel:
                 f"min_wheel_speed must be below max_wheel_speed = {self.max_wheel_speed}, "
                 f"got {self.min_wheel_speed}"
             )
-        if self.field_of_view > 360.0:
-            raise ValueError(f"field_of_view must be at most 360 degrees, got {self.field_of_view}")
 
     @classmethod
     def from_fields(cls, values: Mapping[str, Any]) -> RobotModel:
@@ -241,6 +239,8 @@ def check_mount(name: str, mount: Any) -> tuple[float, ...]:
         raise ValueError(
             f"{name} must be 3 numbers, x, y [m] and yaw [rad], or 4 with a roll, got {len(found)}"
         )
+    for value, quantity in zip(found, ("offset", "offset", "yaw"), strict=False):
+        check_meant(name, value, quantity)
     roll = abs(found[3]) if found[3:] else 0.0
     if min(roll, abs(roll - math.pi)) > _LEVEL:
         raise ValueError(f"{name} must have a roll of 0 or π, as scans are level, got {found[3]}")

@@ -7,21 +7,25 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from mpfa_envs.checks import MEANT
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.worlds.yaml_nodes import NodeReader
 
 if TYPE_CHECKING:
     import yaml
 
-_UNITS: Final = {
-    "mass": "kg",
-    "min_wheel_speed": "m/s",
-    "max_wheel_speed": "m/s",
-    "wheel_acceleration": "m/s²",
-    "turn_limit": "rad/s",
-    "field_of_view": "deg",
+_ELSEWHERE: Final = {
+    "wheel_separation": "wheel_base",
+    "track_width": "wheel_base",
+    "robot_radius": "radius",
+    "max_vel_x": "max_wheel_speed",
+    "min_vel_x": "min_wheel_speed",
+    "max_velocity": "max_wheel_speed",
+    "min_velocity": "min_wheel_speed",
+    "max_range": "lidar_range",
+    "range_max": "lidar_range",
 }
-"""Units of the numbers that are not in meters."""
+"""Keys that other tools have for the fields."""
 
 
 class RobotFileError(ValueError):
@@ -54,6 +58,7 @@ class _Reader(NodeReader):
     """Turns the nodes of one file into a robot."""
 
     failure = RobotFileError
+    elsewhere = _ELSEWHERE
     hint = "docs/howto/robot.md has a file to start from"
 
     def robot(self, root: yaml.Node | None) -> RobotModel:
@@ -74,9 +79,5 @@ class _Reader(NodeReader):
             return self.text(node, key)
         if key == "lidar_mount":
             return [self.number(each, key, "") for each in self.items(node, key)]
-        value = self.number(node, key, "" if key == "lidar_rays" else f" in {self._unit(key)}")
+        value = self.number(node, key, "" if key == "lidar_rays" else f" in {MEANT[key][2]}")
         return int(value) if key == "lidar_rays" and value.is_integer() else value
-
-    def _unit(self, key: str) -> str:
-        """Return the unit of a number."""
-        return _UNITS.get(key, "m")

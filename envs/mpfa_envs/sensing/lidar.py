@@ -85,8 +85,6 @@ class Lidar:
         self.max_range = check_positive("max_range", max_range)
         self.noise = check_not_negative("noise", noise)
         self.field_of_view = check_positive("field_of_view", field_of_view)
-        if self.field_of_view > 360.0:
-            raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")
         self.dropout = check_share("dropout", dropout)
         rays = check_count("sectors * rays_per_sector", self.sectors * self.rays_per_sector)
         self.angles = ray_angles(self.field_of_view, rays)

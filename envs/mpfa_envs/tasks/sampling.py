@@ -87,10 +87,10 @@ def _sample_points(
     detour = detour_chance > 0.0 and world.obstacle_count > 0 and rng.random() < detour_chance
     straight: Task | None = None
     for _ in range(_STARTS):
-        start = _sample_point(world, rng, world.start_regions, distance + START_SLACK, "start")
+        start = _sample_point(grid, rng, world.start_regions, distance + START_SLACK, "start")
         for _ in range(_GOALS_PER_START):
             clearance = max(GOAL_CLEARANCE, distance)
-            goal = _sample_point(world, rng, world.goal_regions, clearance, "goal")
+            goal = _sample_point(grid, rng, world.goal_regions, clearance, "goal")
             far = math.dist(start, goal) >= min_goal_distance
             if not (
                 far and (grid.joins(start, goal) or is_reachable(world, distance, start, goal))
@@ -104,7 +104,7 @@ def _sample_points(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a path between them"
+        f"{min_goal_distance} m apart with a path between them, in {grid}"
     )
 
 
@@ -172,13 +172,14 @@ def _can_be_won(
 
 
 def _sample_point(
-    world: World,
+    grid: FreeGrid,
     rng: np.random.Generator,
     regions: tuple[Box, ...],
     clearance: float,
     what: str,
 ) -> tuple[float, float]:
     """Sample a point with the clearance [m] from the union of the regions."""
+    world = grid.world
     regions = regions or (world.room,)
     shares = np.cumsum([region.area for region in regions])
     for _ in range(_ATTEMPTS):
@@ -191,7 +192,7 @@ def _sample_point(
             return x, y
     raise ValueError(
         f"world {world.name!r} has no free {what}: {_ATTEMPTS} samples found no point "
-        f"{clearance:.2f} m from every obstacle and wall"
+        f"{clearance:.2f} m from every obstacle and wall, in {grid}"
     )
 
 

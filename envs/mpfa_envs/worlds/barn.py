@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.files import read_file
+from mpfa_envs.files import cause_of, read_file
 from mpfa_envs.worlds.gazebo import read_gazebo_world
 from mpfa_envs.worlds.sdf import LARGEST_FILE
 from mpfa_envs.worlds.task import Task
@@ -143,7 +143,7 @@ def load_barn(archive: str | os.PathLike[str]) -> Iterator[tuple[World, float]]:
         try:
             root = zipfile.Path(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise WorldFileError(f"{path}: cannot be read: {error}") from error
+            raise WorldFileError(f"{path}: cannot be read: {cause_of(error)}") from error
     inside: list[Path | zipfile.Path] = [*root.iterdir()]
     places = [root, *sorted(inside, key=str)]
     folder = next((place for place in places if (place / "path_files").is_dir()), root)
@@ -171,7 +171,7 @@ def _read(file: Path | zipfile.Path, most: int) -> bytes:
             content = stream.read(most + 1)
     # A damaged archive raises many errors: a wrong checksum, header, length, method, password.
     except Exception as error:
-        raise WorldFileError(f"{file}: cannot be read: {error}") from error
+        raise WorldFileError(f"{file}: cannot be read: {cause_of(error)}") from error
     if len(content) > most:
         raise WorldFileError(f"{file}: cannot be read: it has more than {most} bytes")
     return content
@@ -183,7 +183,7 @@ def _read_length(file: Path | zipfile.Path) -> float:
     try:
         cells = np.load(io.BytesIO(content), allow_pickle=False)
     except Exception as error:
-        raise WorldFileError(f"{file}: is no array: {error}") from error
+        raise WorldFileError(f"{file}: is no array: {cause_of(error)}") from error
     if not isinstance(cells, np.ndarray) or cells.dtype.kind not in "iuf":
         raise WorldFileError(f"{file}: must be an array of numbers, got {cells!r:.60}")
     if cells.ndim != 2 or cells.shape[1] != 2 or not len(cells):

@@ -3,9 +3,9 @@
 A pixel's shade says how sure it is that something is there: p = (255 - shade) / 255, or shade / 255
 with ``negate``. Above ``occupied_thresh`` it is occupied, below ``free_thresh`` free. What is in
 between depends on ``mode``: with ``trinary`` it is unknown; with ``scale`` it is occupied from the
-middle of the two thresholds, and transparent pixels are unknown. With ``raw`` shades of 0 to 100
-are p in percent, and above that unknown. With ``trinary`` the shade is the mean of all channels,
-opacity included, as in the map_servers of ROS 1 and Nav2: transparent white is unknown.
+middle of the two thresholds, and pixels that are not wholly opaque are unknown. With ``raw`` shades
+of 0 to 100 are p in percent, and above that unknown. With ``trinary`` the shade is the mean of all
+channels, opacity included, as in the map_servers of ROS 1 and Nav2: transparent white is unknown.
 
 With ``trinary`` and without ``negate`` the shade 205 is always unknown: ROS's own map_saver writes
 it for unknown cells with a ``free_thresh`` of 0.25, under which it would be free.
@@ -27,7 +27,7 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from mpfa_envs.files import read_file
+from mpfa_envs.files import cause_of, read_file
 from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE
 from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError
@@ -49,6 +49,8 @@ _WORDS: Final = {
     for word in words.split()
 }
 """Values of ``negate``."""
+_FINE, _CELL, _COARSE, _MANY = 0.01, 0.05, 0.25, 100
+"""Least, usual and greatest side of a cell [m], the last in a map with more cells on a side."""
 _QUARTERS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Cosine and sine of the quarter turns."""
 _FREE: Final = 254
@@ -108,7 +110,7 @@ def read_map(
             stacklevel=3,
         )
     if opacity is not None and rule.mode == "scale":
-        occupied, free = occupied & (opacity > 0), free & (opacity > 0)
+        occupied, free = occupied & (opacity == 255), free & (opacity == 255)
     if unknown == "free":
         free = ~occupied
     columns, rows = (np.flatnonzero(free.any(axis=axis)) for axis in (0, 1))
@@ -118,6 +120,12 @@ def read_map(
     top, bottom = max(rows[0] - 1, 0), min(rows[-1] + 2, len(free))
     left, right = max(columns[0] - 1, 0), min(columns[-1] + 2, free.shape[1])
     kept = np.rot90(~free[top:bottom, left:right][::-1].T, quarters)
+    if resolution < _FINE or (resolution > _COARSE and max(kept.shape) > _MANY):
+        wide, deep = np.multiply(kept.shape, resolution)
+        meant = resolution / 10.0 ** round(math.log10(resolution / _CELL))
+        text = f"resolution = {resolution:g} makes a room of {wide:.4g} x {deep:.4g} m"
+        where = reader.error(entries["resolution"], text)
+        warnings.warn(f"{where}; did you mean {meant:.4g}?", stacklevel=3)
     reader.check_size(entries["image"], kept.shape, resolution)
     cosine, sine = _QUARTERS[quarters % 4]
     ends = np.array([[left, len(free) - bottom], [right, len(free) - top]]) * resolution
@@ -214,7 +222,7 @@ class _Reader(NodeReader):
             raise self.error(node, text) from None
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             kinds = ", ".join(("PGM", *_FORMATS))
-            text = f"image must be one of {kinds}, and {path} cannot be read: {error}"
+            text = f"image must be one of {kinds}, and {path} cannot be read: {cause_of(error)}"
             raise self.error(node, text) from error
 
     def check_size(self, node: yaml.Node, size: tuple[int, ...], resolution: float) -> None:

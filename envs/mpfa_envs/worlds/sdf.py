@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat
 
-from mpfa_envs.files import read_file
+from mpfa_envs.files import cause_of, read_file
 from mpfa_envs.worlds.yaml_nodes import WorldFileError, read_number
 
 LARGEST_FILE: Final = 20_000_000
@@ -27,6 +27,12 @@ _MARKS: Final = re.compile(
 """Comments, quoted text and declarations; one without an end is tried once."""
 _AMPERSAND: Final = re.compile(rb"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 """An ampersand that begins no character."""
+_STAGE: Final = re.compile(rb"^\s*(?:define\s+\w+\s+)?\w+\s*\(", re.MULTILINE)
+"""A part of a world of Stage, whose files have the same ending."""
+_OF_STAGE: Final = (
+    "is a world of Stage, not of Gazebo: give its bitmap as a ROS map, a .yaml file with the keys "
+    "image, resolution, origin, negate, occupied_thresh and free_thresh"
+)
 _JUNK: Final = expat.errors.codes[expat.errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT]
 
 
@@ -106,7 +112,9 @@ class SdfFiles:
             raise
         except (expat.ExpatError, LookupError, ValueError) as reason:  # The last two: its encoding.
             if getattr(reason, "code", None) != _JUNK:
-                raise error(f"is not XML: {reason}") from reason
+                stage = b"<" not in text and _STAGE.search(text)
+                what = _OF_STAGE if stage else f"is not XML: {reason}"
+                raise error(what) from reason
         return document.children[0]
 
     def included(self, include: Element) -> Element | None:
@@ -172,7 +180,7 @@ def read_sdf(path: Path) -> bytes:
         if path.suffix.lower() == ".gz":
             content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(LARGEST_FILE + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise WorldFileError(f"{path}: cannot be read: {error}") from error
+        raise WorldFileError(f"{path}: cannot be read: {cause_of(error)}") from error
     if len(content) > LARGEST_FILE:
         raise WorldFileError(f"{path}: has more than {LARGEST_FILE} bytes")
     return content

@@ -5,13 +5,15 @@ from __future__ import annotations
 import codecs
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import yaml
 
 from mpfa_envs.checks import did_you_mean
-from mpfa_envs.files import read_file
+from mpfa_envs.files import cause_of, read_file
 
 _LARGEST_FILE: Final = 1_000_000
 """Longest text that is read [bytes]."""
@@ -63,6 +65,8 @@ class NodeReader:
     """What is raised; the message names the file and the line."""
     hint = f"a world is read from {KINDS}"
     """What the file should be, for a file that is something else."""
+    elsewhere: Mapping[str, str] = MappingProxyType({})
+    """Keys that other tools have for the keys."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -90,7 +94,7 @@ class NodeReader:
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             where = f"{self.path}:{mark.line + 1}" if mark else str(self.path)
-            problem = getattr(error, "problem", error)
+            problem = getattr(error, "problem", None) or cause_of(error)
             raise self.failure(f"{where}: is not YAML: {problem}") from error
         except RecursionError:
             raise self.failure(f"{self.path}: is nested too deeply") from None
@@ -112,7 +116,7 @@ class NodeReader:
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
             if name is None or name not in keys:
-                hint = did_you_mean(name, keys)
+                hint = did_you_mean(self.elsewhere.get(name or "", name), keys)
                 self.unknown(self.error(key, f"unknown key {name!r} in {what}"), hint, keys)
                 continue
             if name in entries:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from tqdm import tqdm
@@ -16,35 +14,17 @@ from tqdm import tqdm
 from torchrl_mpfa import Stop
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
+from training.comparison.options import JOBS
 from training.comparison.workers import LocalWorker, Lost, Worker
 
 LOG = "output.log"
 """Output of the scripts, in the folder of a run."""
-JOBS = 2
-"""Runs at a time on one machine."""
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
 MOST_LOSSES = 10
 """Workers that may be lost under a run, which may be the cause itself."""
 Item = TypeVar("Item")
 Commands = list[list[str]]
-
-
-def add_options(parser: argparse.ArgumentParser, *, folder: str, what: str) -> None:
-    """Add the options of where a script makes its runs or trials, and how many at a time."""
-    parser.add_argument("--folder", type=Path, default=Path(folder), help=f"(default: {folder})")
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        help=f"{what} at a time (default: {JOBS}; with --ray as many as fit)",
-    )
-    parser.add_argument(
-        "--ray",
-        nargs="?",
-        const="",
-        metavar="ADDRESS",
-        help="run on a Ray cluster (default: that of RAY_ADDRESS, or of this machine)",
-    )
 
 
 class Running:

@@ -14,6 +14,7 @@ from mpfa_envs import load_policy
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.arms import PLAIN, Arm, with_defaults
+from training.comparison.options import EPISODES, WORLDS
 from training.evaluating import evaluation_folder, needs_filter
 from training.finished import is_finished, read_json
 from training.plugins import plugin_words
@@ -52,7 +53,7 @@ class Evaluation:
     """Path of the plugin."""
 
 
-TESTED = Evaluation(("test",), 200)
+TESTED = Evaluation(WORLDS, EPISODES)
 """Evaluation by ``compare.py`` unless its command line names another."""
 
 

@@ -20,10 +20,13 @@ from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.jobs import run_name
 from training.figures import Runs, plot_evaluations
-from training.records import read_table
+from training.records import checked_numbers, checked_words, read_table
 from training.statistics import FEWEST, Array, holm, mean_interval, permuted_difference
 from training.worlds import family
 
+_WORDS = ("learner", "method", "seed", "world", "episode")
+_NUMBERS = ("success", "collision", "timeout", "spl", "time_s")
+_OF_EVALUATIONS = ("total_steps", "success")
 RATES = (0.9, 0.95)
 """Rates of greedy success in validation of which the time until then is reported."""
 ARM = ("learner", "method", "arm")
@@ -89,12 +92,15 @@ def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
         found = read_table(folder / files.EPISODES)
         if not len(found):
             continue
-        missing = [name for name in ("learner", "method", "seed", "world") if name not in found]
+        missing = [name for name in (*_WORDS, *_NUMBERS) if name not in found]
         if missing:
             raise ValueError(
                 f"{folder / files.EPISODES} has no column {missing[0]}: name the folder of a "
                 "comparison, which compare.py made, not that of a run"
             )
+        checked_words(found, _WORDS, folder / files.EPISODES)
+        for column in _NUMBERS:
+            found[column] = checked_numbers(found, column, folder / files.EPISODES)
         for column in ("arm", "physics"):
             found[column] = found[column].fillna("") if column in found else ""
         words = found[["learner", "method", "arm", "seed"]]
@@ -110,15 +116,26 @@ def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
         raise ValueError(
             f"{', '.join(names)}: no {files.EPISODES} with rows, which compare.py writes"
         )
-    return pd.concat(tables, ignore_index=True)
+    rows = pd.concat(tables, ignore_index=True)
+    names = ["arm", "run", "physics", "world", "episode"]
+    if (twice := rows.duplicated(names)).any():
+        one = ", ".join(f"{name} {value}" for name, value in rows[twice].iloc[0][names].items())
+        raise ValueError(f"a run must have one row for each episode, got two of {one}")
+    return rows
 
 
 def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
     """Return a table of each run's folder, by arm and run; runs without the table are left out."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for (arm, run, path), _ in rows.groupby(["arm", "run", "path"], sort=False):
-        table = read_table(Path(str(path)) / name)
+        file = Path(str(path)) / name
+        table = read_table(file)
         if len(table):
+            missing = [column for column in _OF_EVALUATIONS if column not in table]
+            if missing:
+                raise ValueError(f"{file} has no column {missing[0]}")
+            for column in _OF_EVALUATIONS:
+                table[column] = checked_numbers(table, column, file)
             found.setdefault(str(arm), {})[str(run)] = table
     return found
 

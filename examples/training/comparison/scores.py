@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,18 +13,13 @@ from mpfa_envs.render.charts import Curve
 from training import files
 from training.comparison.report import difference_table, interval, number, table, write_tables
 from training.figures import plot_scores
-from training.records import read_table
+from training.records import checked_numbers, checked_words, read_words
 from training.statistics import mean_interval
 
 COLUMNS = ("task", "method", "seed", "steps", "score")
 CURVES = "curves.png"
 Runs = dict[str, dict[str, Curve]]
 """Curves of the runs of a task, by method and seed."""
-
-
-def are_scores(path: Path) -> bool:
-    """Return True unless a path is the folder of a comparison of ``compare.py``."""
-    return path.is_file() or not (path / files.EPISODES).exists()
 
 
 def write_scores(paths: Sequence[Path], output: Path) -> str:
@@ -53,7 +49,7 @@ def read_scores(paths: Sequence[Path]) -> pd.DataFrame:
     for path in paths:
         found = [path] if path.is_file() else sorted(path.rglob("*.csv"))
         for file in found:
-            rows = read_table(file)
+            rows = read_words(file)
             missing = [name for name in COLUMNS if name not in rows]
             if not missing and len(rows):
                 tables.append(_checked(rows[list(COLUMNS)].copy(), file))
@@ -68,20 +64,28 @@ def read_scores(paths: Sequence[Path]) -> pd.DataFrame:
     twice = rows[rows.duplicated(["task", "method", "seed", "steps"])]
     if len(twice):
         one = ", ".join(f"{name} {twice.iloc[0][name]}" for name in COLUMNS[:-1])
-        raise ValueError(f"a run must have one score at each step, got two of {one}")
+        raise ValueError(
+            f"{twice.iloc[0]['line']}: a run must have one score at each step, got two of {one}"
+        )
     return rows
 
 
 def _checked(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
     """Return the rows with steps and scores as numbers; raise where they are none."""
+    names = ["task", "method", "seed"]
+    checked_words(rows, names, file)
     for name in ("steps", "score"):
-        rows[name] = pd.to_numeric(rows[name], errors="coerce").astype(float)
-        if not np.isfinite(rows[name]).all():
-            line = int(np.flatnonzero(~np.isfinite(rows[name]))[0]) + 2
-            raise ValueError(f"{file}:{line}: {name} must be a finite number")
-    for name in ("task", "method", "seed"):
-        rows[name] = rows[name].astype(str)
+        rows[name] = checked_numbers(rows, name, file)
+    for name in names:
+        rows[name] = rows[name].str.strip()
+    rows["seed"] = rows["seed"].map(_seed)
+    rows["line"] = [f"{file}:{index + 2}" for index in rows.index]
     return rows
+
+
+def _seed(text: str) -> str:
+    """Return a seed as an integer is written: a column that once had a gap has 1.0 for 1."""
+    return re.sub(r"^(-?\d+)\.0*$", r"\1", text)
 
 
 def runs_of(rows: pd.DataFrame) -> Runs:

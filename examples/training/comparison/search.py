@@ -23,8 +23,9 @@ from tqdm import tqdm
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.arms import Arm
-from training.comparison.execution import JOBS, LOG, Commands, Work, workers_of
+from training.comparison.execution import LOG, Commands, Work, workers_of
 from training.comparison.jobs import Job
+from training.comparison.options import JOBS
 from training.comparison.ranges import Ranges, as_lines, fixed_settings
 from training.comparison.workers import Worker
 from training.figures import plot_search
@@ -256,6 +257,13 @@ def run_search(
             search = Search(study, plan, folder, trials=trials, workers=workers)
             stop = search.run()
         write_results(study, plan, folder)
+        best = best_of(study)
+        if best is not None and (others := equals_of(best, study)):
+            names = ", ".join(map(str, others))
+            print(
+                f"trial {best.number} is not better than {names}: all have {plan.objective} "
+                f"{best.value:.4f}; the first of them is kept"
+            )
     if stop:
         return stop.exit_status
     return int(search.failures > 0)
@@ -297,6 +305,13 @@ def best_of(study: optuna.Study) -> FrozenTrial | None:
     """Return the complete trial with the highest value."""
     ended = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
     return max(ended, key=lambda trial: trial.value or 0.0, default=None)
+
+
+def equals_of(best: FrozenTrial, study: optuna.Study) -> list[int]:
+    """Return the numbers of the other complete trials with the value of the best."""
+    ended = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    values = {each.number: each.value for each in ended if each.number != best.number}
+    return [number for number, value in values.items() if value == best.value]
 
 
 def write_best(best: FrozenTrial, plan: Plan, path: Path) -> None:

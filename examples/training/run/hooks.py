@@ -130,6 +130,7 @@ def report(run: TrainingRun, *, saved: bool = False) -> str:
         "total": run.schedule.total,
         "episodes": run.schedule.episodes,
         "steps": run.actions,
+        "updates": run.updates,
         "summary": summary,
         "given_up": run.robots.given_up,
         "finished": run.schedule.finished and saved,

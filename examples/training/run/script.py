@@ -21,7 +21,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.finished import after_the_end, is_finished
+from training.finished import after_the_end, is_finished, nothing_learned
 from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
@@ -34,6 +34,7 @@ from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import with_lines
 from training.settings.resuming import changed, check_lawful, check_single
 from training.settings.train import TrainSettings, as_settings, plain_settings, register
+from training.understood import understood
 
 WRONG = 2
 """Exit status of a command line that cannot be."""
@@ -130,6 +131,8 @@ def start(settings: TrainSettings, folder: Path, hooks: Sequence[Hook] = ()) -> 
             # Only now: a setting that the parts reject leaves the old run in its place.
             files.set_aside(folder)
             write_settings(settings, folder / files.SETTINGS)
+        worlds = [*(stage.world for stage in settings.curriculum.stages), settings.evaluation.world]
+        print(understood(settings.environment.robot, worlds))
         if method_of(settings) != settings.method:
             print(f"learner={settings.learner.name} has no action gradient: it is left out")
         return _train(training)
@@ -214,7 +217,14 @@ def _train(training: TrainingRun) -> int:
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
-        print(f"policy: {folder / files.POLICY}   curve: {curve}")
+        made = (
+            f"   curve: {curve}"
+            if training.records
+            else " (no episode has ended, and so there is no curve)"
+        )
+        print(f"policy: {folder / files.POLICY}{made}")
+        if not training.updates:
+            print(nothing_learned(training.actions, training.settings.method.rows))
         return 0
     saved = (folder / files.CHECKPOINT).exists()
     plugin = training.settings.plugin

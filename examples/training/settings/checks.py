@@ -14,7 +14,8 @@ import torch
 from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
-from training.environments import check_physics, make_training_env, task_arguments
+from training.environments import make_training_env, task_arguments
+from training.evaluating import check_physics
 from training.plugins import OF_LOSSES, SIGNALS
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete

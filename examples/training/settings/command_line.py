@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import cache
 from itertools import pairwise, product
 
@@ -14,8 +14,8 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
+from mpfa_envs.robots.resolve import resolve_robot
 from torchrl_mpfa.methods import METHODS, Method
-from training.settings.checks import check_settings
 from training.settings.from_file import lines_of, quoted
 from training.settings.rules import named, settings_by_name
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
@@ -97,6 +97,16 @@ def choices_of(override: Override) -> list[str]:
 
 def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
     """Yield the settings of each run of a command line, checked."""
+    for settings in read_settings(arguments):
+        # Imports TorchRL, which takes two seconds: what is misspelt is answered before.
+        from training.settings.checks import check_settings
+
+        check_settings(settings)
+        yield settings
+
+
+def read_settings(arguments: Sequence[str]) -> Iterator[TrainSettings]:
+    """Yield the settings of each run of a command line; names and types are checked."""
     alternatives = []
     for override in parse_overrides(arguments):
         text = override.input_line or ""
@@ -112,7 +122,8 @@ def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
                 settings = as_settings(compose("train", list(texts)))
         except (HydraException, OmegaConfBaseException) as error:
             raise ValueError(_one_line(error)) from error
-        check_settings(settings)
+        with named("environment."):
+            resolve_robot(settings.environment.robot)
         yield settings
 
 
@@ -123,12 +134,13 @@ def _one_line(error: Exception) -> str:
         cause = cause.__cause__
     key = getattr(cause, "full_key", None)
     kind = getattr(cause, "object_type", None)
-    if (
-        isinstance(cause, AttributeError | KeyError)
-        and isinstance(kind, type)
-        and issubclass(kind, Method)
-    ):
-        return f"this method has no {key}, but {', '.join(each.name for each in fields(kind))}"
+    if isinstance(cause, AttributeError | KeyError) and is_dataclass(kind):
+        names = [each.name for each in fields(kind)]
+        if isinstance(kind, type) and issubclass(kind, Method):
+            return f"this method has no {key}, but {', '.join(names)}"
+        word = str(key).rpartition(".")[2]
+        hint = _nearest(word, names) or f", but {', '.join(names)}"
+        return f"{getattr(kind, '__name__', kind)} has no {word!r}{hint}"
     text = str(getattr(cause, "msg", None) or cause).splitlines()[0]
     return f"{key}: {text}" if key else text
 
@@ -137,6 +149,10 @@ def _nearest(word: str, known: Iterable[str]) -> str:
     """Suggest the nearest known name."""
     # Most mistakes are typos, or settings without the section they are in.
     names = list(known)
+    section, _, last = word.rpartition(".")
+    beside = {n.rpartition(".")[2]: n for n in names if section and n.rpartition(".")[0] == section}
+    if in_section := difflib.get_close_matches(last, beside, n=1):
+        return f": did you mean {beside[in_section[0]]!r}?"
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     inside = [name for name in names if name.split(".")[-1] == word.split(".")[-1]]
     typo = difflib.get_close_matches(word, [n for n in names if "." not in n], n=1, cutoff=0.8)

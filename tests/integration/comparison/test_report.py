@@ -143,3 +143,34 @@ def test_runs_on_other_pairs_are_not_compared(
         report.main([str(comparison)])
     assert ended.value.code == 2
     assert "not tested on the same pairs" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("tables_alone")
+@pytest.mark.parametrize(
+    ("column", "value", "error"),
+    [
+        ("method", "", r"episodes.csv:2: method must not be empty"),
+        ("seed", "", r"episodes.csv:2: seed must not be empty"),
+        ("success", "maybe", r"episodes.csv:2: success must be a finite number, got 'maybe'"),
+        ("spl", "", r"episodes.csv:2: spl must be a finite number, got an empty cell"),
+        ("episode", 1, r"a run must have one row for each episode, got two of arm"),
+    ],
+)
+def test_a_row_of_a_comparison_that_cannot_be_used_is_rejected(
+    comparison: Path, column: str, value: object, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv").astype({column: object})
+    rows.loc[0, column] = value
+    write_table(rows, comparison / "episodes.csv")
+    with pytest.raises(SystemExit):
+        report.main([str(comparison)])
+    assert error in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("tables_alone")
+def test_truth_values_in_words_count_as_they_do_in_numbers(comparison: Path) -> None:
+    words = {"True": "true", "False": "false", "1": "TRUE", "0": "FALSE", "1.0": "1", "0.0": "0"}
+    changed = tables_of(
+        comparison, lambda rows: rows.assign(success=rows["success"].astype(str).map(words))
+    )
+    assert LINE in changed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -119,3 +120,117 @@ def test_comparisons_and_scores_are_not_mixed(
         with pytest.raises(SystemExit):
             report.main([str(word) for word in words])
         assert message in capsys.readouterr().err
+
+
+def written(folder: Path, text: str, encoding: str = "utf-8") -> int:
+    (folder / "scores.csv").write_text(text, encoding=encoding)
+    return report.main([str(folder / "scores.csv")])
+
+
+@pytest.mark.parametrize(
+    ("row", "error"),
+    [
+        ("t,new,,0,1", "3: seed must not be empty"),
+        ("t,,0,0,1", "3: method must not be empty"),
+        (",new,0,0,1", "3: task must not be empty"),
+        ("t,  ,0,0,1", "3: method must not be empty"),
+        ("t,new,0,0,", "3: score must be a finite number, got an empty cell"),
+        ("t,new,0,0,nan", "3: score must be a finite number, got 'nan'"),
+        ("t,new,0,0,-inf", "3: score must be a finite number, got '-inf'"),
+        ("t,new,0,0,good", "3: score must be a finite number, got 'good'"),
+        ("t,new,0,1 000,1", "3: steps must be a finite number, got '1 000'"),
+        ("t,new,0,0", "3: score must be a finite number, got an empty cell"),
+        ("t,old,0.0,0,1", "3: a run must have one score at each step, got two of task t"),
+        ("\n\nt,new,,0,1", "5: seed must not be empty"),
+        ("t,new,0,0,1,9,9\n1,2,3,4,5,6,7,8", "its rows cannot be read"),
+    ],
+)
+def test_a_row_that_cannot_be_used_is_rejected_by_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, error: str
+) -> None:
+    with pytest.raises(SystemExit):
+        written(tmp_path, f"task,method,seed,steps,score\nt,old,0,0,1\n{row}\n")
+    assert f"scores.csv:{error}" in (said := capsys.readouterr().err) or error in said
+
+
+@pytest.mark.parametrize("text", ["", "\n", "task,method\n", "task,method,seed,steps,score\n"])
+def test_a_table_without_rows_is_rejected_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    with pytest.raises(SystemExit):
+        written(tmp_path, text)
+    assert "scores.csv" in capsys.readouterr().err.splitlines()[-1]
+
+
+ROWS = "task,method,seed,steps,score\nt,old,0,0,1\nt,old,0,10,2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (ROWS, "utf-8-sig"),
+        (ROWS.replace(",", ";"), "utf-8"),
+        (ROWS.replace(",", "\t"), "utf-8"),
+        (ROWS.replace(",", ", "), "utf-8"),
+        (ROWS.replace("\n", "\r\n"), "utf-8"),
+        (ROWS.replace("\n", "\n\n"), "utf-8"),
+        (ROWS.replace("old,0,", "old,0.00,"), "utf-8"),
+        ("x,task,method,seed,steps,score\n9,t,old,0,0,1\n9,t,old,0,10,2\n", "utf-8"),
+    ],
+)
+def test_other_forms_of_a_table_are_read_alike(tmp_path: Path, text: str, encoding: str) -> None:
+    assert written(tmp_path, text, encoding) == 0
+    assert "| old | 2.000 | one run |" in (tmp_path / "tables.md").read_text(encoding="utf-8")
+
+
+def test_one_row_and_truth_values_are_scores(tmp_path: Path) -> None:
+    assert written(tmp_path, "task,method,seed,steps,score\nt,a,0,5,True\nt,b,x,5,False\n") == 0
+    text = (tmp_path / "tables.md").read_text(encoding="utf-8")
+    assert "| a | 1.000 |" in text and "| b | 0.000 |" in text
+
+
+def recipes() -> dict[str, Any]:
+    """What the page on files defines to read the curves of other tools."""
+    names: dict[str, Any] = {}
+    page = Path(__file__).parents[3] / "docs" / "metrics.md"
+    for block in re.findall(
+        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M
+    ):
+        exec(block, names)
+    return names
+
+
+def test_monitors_of_stable_baselines_are_read_as_on_the_page(tmp_path: Path) -> None:
+    monitor = pytest.importorskip("stable_baselines3.common.monitor")
+    gymnasium = pytest.importorskip("gymnasium")
+    page, curves = recipes(), {}
+    for seed in range(2):
+        env = monitor.Monitor(gymnasium.make("CartPole-v1"), str(tmp_path / str(seed)))
+        env.action_space.seed(seed)
+        for episode in range(3):
+            env.reset(seed=seed + 10 * episode)
+            while not any(env.step(env.action_space.sample())[2:4]):
+                pass
+        env.close()
+        curves["CartPole", "random", seed] = page["of_monitor"](tmp_path / f"{seed}.monitor.csv")
+        assert len(curves["CartPole", "random", seed]) == 3
+    page["write_scores"](curves, tmp_path / "scores.csv")
+    assert report.main([str(tmp_path / "scores.csv")]) == 0
+    assert "| random | " in (tmp_path / "tables.md").read_text(encoding="utf-8")
+
+
+def test_exports_of_wandb_and_tensorboard_are_read_as_on_the_page(tmp_path: Path) -> None:
+    page = recipes()
+    (tmp_path / "wandb.csv").write_text(
+        '"Step","a - eval","a - eval__MIN","a - eval__MAX","b - eval","b - eval__MIN"\n'
+        '"0","1","1","1","",""\n"10","3","3","3","5","5"\n"20","4","4","4","7","7"\n'
+    )
+    (tmp_path / "board.csv").write_text("Wall time,Step,Value\n1.7e9,0,2\n1.7e9,20,6\n")
+    curves = {("t", run, 0): page["of_wandb"](tmp_path / "wandb.csv", run) for run in "ab"}
+    curves["t", "c", 0] = page["of_tensorboard"](tmp_path / "board.csv")
+    page["write_scores"](curves, tmp_path / "scores.csv")
+    assert report.main([str(tmp_path / "scores.csv")]) == 0
+    text = (tmp_path / "tables.md").read_text(encoding="utf-8")
+    assert all(
+        f"| {name} | {score}.000 |" in text for name, score in zip("abc", "476", strict=True)
+    )
