@@ -8,7 +8,6 @@ https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, check
+from torchrl_mpfa.checks import BELOW_ONE, LEVEL, POSITIVE, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.storages.table import SignalTable
@@ -30,15 +29,6 @@ Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 _ROUNDING = 64
 """Units in the last place by which a priority has to exceed the mean of its batch."""
-
-
-def check_level(positive_above: Level) -> None:
-    """Reject a level that is neither a finite number nor ``"mean"``."""
-    number = isinstance(positive_above, int | float) and not isinstance(positive_above, bool)
-    if positive_above != "mean" and not (number and math.isfinite(positive_above)):
-        raise ValueError(
-            f"positive_above must be a finite number or 'mean', got {positive_above!r}"
-        )
 
 
 def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
@@ -229,9 +219,7 @@ class PositiveBoost:
     takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, boost=self.boost)
-        check_level(self.positive_above)
-        check(BELOW_ONE, target_share=self.target_share)
+        keep(self, boost=POSITIVE, positive_above=LEVEL, target_share=BELOW_ONE)
         if self.target_share > 0 and self.boost < 1:
             raise ValueError(f"boost must be at least 1 with a target_share, got {self.boost}")
         if self.bound not in ("floor", "cap", "none"):
@@ -288,8 +276,7 @@ class PositiveDecay:
     takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, sharpness=self.sharpness)
-        check_level(self.positive_above)
+        keep(self, sharpness=POSITIVE, positive_above=LEVEL)
         if self.position not in ("batch", "rank", "count"):
             raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")
 

@@ -82,7 +82,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self.stale_updates = 0
         self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
-            check_counts(batch_size=batch_size)
+            kwargs["batch_size"] = check_counts(batch_size=batch_size)
         if (prefetch := kwargs.get("prefetch")) not in (None, 0):
             raise ValueError(
                 f"prefetch must be None, got {prefetch!r}: a batch that is sampled ahead knows "
@@ -159,7 +159,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 updated.
         """
         if batch_size is not None:
-            check_counts(batch_size=batch_size)
+            batch_size = check_counts(batch_size=batch_size)
         if isinstance(self.sampler, PrioritizedSampler):
             self._count_batch()
         if return_info or include_info is not None or not self._fuses:

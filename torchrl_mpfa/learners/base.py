@@ -113,7 +113,7 @@ class OptimizedLearner:
     def __init__(
         self, loss: Any, groups: list[dict[str, Any]], optimizer: OptimizerName, tau: float
     ) -> None:
-        check(ABOVE_ZERO, tau=tau)
+        tau = check(ABOVE_ZERO, tau=tau)
         self.loss: Any = loss
         self.optimizer = make_optimizer(optimizer, groups)
         self._rates = [group["lr"] for group in groups]
@@ -184,7 +184,7 @@ class OptimizedLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        check(SHARE, factor=factor)
+        factor = check(SHARE, factor=factor)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * factor
 
@@ -281,11 +281,12 @@ class ActorCriticLearner(OptimizedLearner):
             raise TypeError(f"loss must be a SignalLoss, got {type(loss).__name__}")
         if loss.reduction == "none":
             raise ValueError("reduction of the loss must be 'mean' or 'sum', got 'none'")
-        self.policy_delay = loss.policy_delay if policy_delay is None else policy_delay
-        check_counts(policy_delay=self.policy_delay)
-        check(POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr, alpha_lr=alpha_lr)
-        check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)
-        decay = {"weight_decay": critic_weight_decay}
+        delay = loss.policy_delay if policy_delay is None else policy_delay
+        self.policy_delay: int = check_counts(policy_delay=delay)
+        actor_lr, critic_lr, alpha_lr = check(
+            POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr, alpha_lr=alpha_lr
+        )
+        decay = {"weight_decay": check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)}
         groups = [
             {"params": loss.actor_parameters(), "lr": actor_lr},
             {"params": loss.critic_parameters(), "lr": critic_lr, **decay},

@@ -69,8 +69,8 @@ class SignalDQNLoss(HoldsNetworks, DQNLoss):
         check_importance(importance)
         if loss_function not in _DISTANCES:
             raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
-        check(POSITIVE, reward_scale=reward_scale)
-        check(SHARE, gamma=gamma)
+        reward_scale = check(POSITIVE, reward_scale=reward_scale)
+        gamma = check(SHARE, gamma=gamma)
         super().__init__(
             value_network,
             loss_function=loss_function,

@@ -71,7 +71,7 @@ class SignalStorageMixin:
         allow_nonfinite: Sequence[NestedKey] = (),
         **kwargs: Any,
     ) -> None:
-        check_counts(max_size=max_size)
+        max_size = check_counts(max_size=max_size)
         self._allow_nonfinite = tuple(allow_nonfinite)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key, **self._mapped)
         super().__init__(max_size, **kwargs)  # type: ignore[call-arg]

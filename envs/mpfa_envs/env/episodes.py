@@ -6,6 +6,7 @@ import copy
 import math
 import os
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -75,7 +76,7 @@ class EpisodeSource:
         """Worlds of the generator that had no task."""
         self._config = config
         least, most = config.min_goal_distance, max_goal_distance
-        if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
+        if isinstance(most, bool) or not isinstance(most, Real) or not most > least:
             raise ValueError(
                 f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
             )
@@ -86,7 +87,7 @@ class EpisodeSource:
         self._split = split
         self._generator = _generator_of(world)
         if difficulty is not None:
-            check_share("difficulty", difficulty)
+            difficulty = check_share("difficulty", difficulty)
             if self._generator is None:
                 raise ValueError(
                     "difficulty must be None unless world is the name of a generator, got "
