@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl_mpfa.checks import as_mask, check_counts, generator_on
 from torchrl_mpfa.saving import check_saved, load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
-from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
+from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, as_index, check_finite_entries
 from torchrl_mpfa.storages.table import SignalTable
 
 _FORMAT = 1
@@ -115,13 +115,14 @@ class SignalStorageMixin:
 
     def get(self, index: Any) -> Any:
         """Read transitions; all slots come as a tensordict that shares their tensors."""
-        found = super().get(index)  # type: ignore[misc]
+        found = super().get(as_index(index))  # type: ignore[misc]
         # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
         own = found is self._storage and isinstance(found, TensorDictBase)  # type: ignore[attr-defined]
         return found.copy() if own else found
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Write transitions and reset the signals of their slots, or raise as :meth:`check`."""
+        cursor = as_index(cursor)
         rows, pairs = self.check(_as_batch(data))
         size = len(self)  # type: ignore[arg-type]
         try:
