@@ -69,11 +69,9 @@ def check_finite_entries(
 
 def as_index(index: Any) -> Any:
     """Return the index in such an entry of an ensemble's batch; anything else as it is."""
-    if not is_tensor_collection(index):
-        return index
-    if (found := index.get(INDEX_KEY, None)) is None:
-        raise TypeError(f"index must hold integers, got a {_kind(index)} without {INDEX_KEY!r}")
-    return found
+    if is_tensor_collection(index) and (index := index.get(INDEX_KEY, None)) is None:
+        raise TypeError(f"index must hold integers, got a tensordict without {INDEX_KEY!r}")
+    return index
 
 
 def as_integers(index: Any) -> Tensor:

@@ -6,6 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +19,7 @@ from torchrl_mpfa.checks import as_mask, check_counts, generator_on
 from torchrl_mpfa.saving import check_saved, load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, as_index, check_finite_entries
-from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.storages.table import SignalTable, allocate
 
 _FORMAT = 1
 _FILE = "signals.pt"
@@ -280,8 +281,12 @@ class SignalStorageMixin:
         self._settle_loaded(signals)
 
     def dumps(self, path: str | Path) -> None:
-        """Save data and signals in a folder, with a checksum of each of its files."""
+        """Save data and signals in a folder, with checksums, or raise ``OSError`` if it is full."""
         path = Path(path)
+        path.mkdir(exist_ok=True)
+        if is_tensor_collection(data := self._storage):  # type: ignore[attr-defined]
+            with NamedTemporaryFile(dir=path) as room:  # TorchRL asks for none.
+                allocate(room.name, data.bytes())
         super().dumps(path)  # type: ignore[misc]
         state = {"_signals": self.signal_table.state_dict(), "_signals_format": _FORMAT}
         save_atomically(state, path / _FILE)
