@@ -30,10 +30,7 @@ COUNT_OR_ZERO: Rule = (
     "an integer from 0 to 2147483646",
 )
 LEVEL: Rule = (
-    lambda value: (
-        value == "mean"
-        or (isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value))
-    ),
+    lambda x: x == "mean" or (isinstance(x, Real) and type(x) is not bool and math.isfinite(x)),
     "a finite number or 'mean'",
 )
 

@@ -39,7 +39,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import Level
-from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, check, check_finite, keep
+from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, Rule, check, check_finite, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.storages.table import SignalTable
@@ -250,9 +250,8 @@ class EntropyFusion:
         names = self.reward_signals
         if isinstance(names, str) or not isinstance(names, Sequence | None):
             raise TypeError(f"reward_signals must be names, got {self.reward_signals!r}")
-        keep(self, positive_above=LEVEL, floor=BELOW_ONE)
-        if self.population not in ("buffer", "batch"):
-            raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
+        population: Rule = (lambda word: word in ("buffer", "batch"), "'buffer' or 'batch'")
+        keep(self, positive_above=LEVEL, floor=BELOW_ONE, population=population)
         if self.positive_above == "mean":
             warnings.warn(
                 "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "

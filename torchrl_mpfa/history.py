@@ -51,14 +51,11 @@ class ReplayHistory:
         self._counts: dict[str, list[Any]] = {}
 
     def add(self, step: int, buffer: SignalReplayBuffer) -> None:
-        """Add histograms of a buffer as it is.
+        """Add histograms of a buffer as it is, or raise ``ValueError`` for a step that is no count.
 
         Args:
             step: The time, such as the number of actions so far.
             buffer: The buffer.
-
-        Raises:
-            ValueError: If ``step`` is no integer, or negative; nothing is added.
         """
         step = check(COUNT_OR_ZERO, step=step)
         for name, values in buffer.distributions().items():

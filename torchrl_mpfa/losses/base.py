@@ -15,7 +15,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, Rule, check, check_counts
 from torchrl_mpfa.losses.functional import (
     DISTANCES,
     LEAST_NOISE,
@@ -70,10 +70,8 @@ class SignalKeys:
     information_gain_signal: NestedKey = INFORMATION_GAIN.key
 
 
-def check_importance(importance: str) -> None:
-    """Reject an unknown use of importance weights."""
-    if importance not in ("critic", "torchrl", "none"):
-        raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
+_USES = ("critic", "torchrl", "none")
+IMPORTANCE: Rule = (lambda use: use in _USES, "'critic', 'torchrl' or 'none'")
 
 
 class SignalLoss(HoldsNetworks):
@@ -149,7 +147,7 @@ class SignalLoss(HoldsNetworks):
         unknown = [name for name in signals if name not in KNOWN_SIGNALS]
         if unknown:
             raise ValueError(f"signals must be among {KNOWN_SIGNALS}, got {unknown}")
-        check_importance(importance)
+        check(IMPORTANCE, importance=importance)
         if kwargs.get("loss_function", "l2") not in DISTANCES:
             raise ValueError(
                 f"loss_function must be one of {DISTANCES}, got {kwargs['loss_function']!r}"
