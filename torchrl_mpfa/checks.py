@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ COUNT_OR_ZERO: Rule = (
     "an integer from 0 to 2147483646",
 )
 LEVEL: Rule = (
-    lambda x: x == "mean" or (isinstance(x, Real) and type(x) is not bool and math.isfinite(x)),
+    lambda value: value == "mean" or (not isinstance(value, bool | str) and math.isfinite(value)),
     "a finite number or 'mean'",
 )
 
