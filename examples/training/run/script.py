@@ -22,6 +22,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.finished import after_the_end, is_finished
+from training.inherited import forget_single_run
 from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
@@ -77,6 +78,9 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
         _end_with(lambda: start(runs[0], Path(runs[0].run_dir), hooks))
     else:
         # Sweeps, and Hydra's other modes; Hydra composes the settings once more.
+        if len(runs) > 1:
+            forget_single_run()
+
         def run(config: DictConfig) -> None:
             folder = Path(HydraConfig.get().runtime.output_dir)
             _end_with(lambda: start(as_settings(config), folder, hooks))
