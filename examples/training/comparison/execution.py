@@ -234,6 +234,8 @@ def make_runs(
     if a run failed, 128 and the number of the signal that stopped it.
     """
     jobs, wanted = comparison.jobs, comparison.evaluation
+    for job in jobs:
+        files.check_folder(job.path)
     with files.lock(comparison.folder):
         others = other_than_asked(jobs, comparison.settings)
         if others and not anew:

@@ -70,7 +70,10 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
             )
         for settings in runs:
             files.check_folder(Path(settings.run_dir))
-    except ValueError as error:
+        for text in arguments:
+            if text.startswith(("hydra.sweep.dir=", "hydra.sweep.subdir=", "hydra.run.dir=")):
+                files.check_name(Path(text.partition("=")[2]))
+    except (ValueError, OSError) as error:
         _exit(error)
     if resumes:
         _end_with(lambda: resume(Path(str(folders[-1])), overrides, hooks))
@@ -266,6 +269,8 @@ def outside_cause(error: Exception) -> str | None:
             "not enough memory for method.capacity, learner.width, method.batch_size and robots "
             f"as they are ({how_much})"
         )
+    if (full := files.full_disk(error)) is not None:
+        return full
     kinds = {kind.__name__ for kind in type(error).__mro__}
     # By name, as Ray is an extra; its RayTaskError is an error in what a worker did.
     if "RayError" in kinds and "RayTaskError" not in kinds:
