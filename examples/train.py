@@ -25,6 +25,7 @@ from pathlib import Path
 import training.extra  # noqa: F401
 
 # isort: split
+from training import files
 from training.finished import after_the_end, is_finished
 
 
@@ -51,4 +52,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    files.run_script(main)

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -214,10 +214,12 @@ def _train(training: TrainingRun) -> int:
     from training.figures import plot_learning_curve
 
     curve = folder / files.CURVE
-    if training.records:
-        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
-    if histograms := training.log.history.histograms():
-        plot_histograms(histograms, folder / files.HISTOGRAMS)
+    # A disk that was full for the checkpoint is so for a chart.
+    with suppress(*([] if failure is None else [OSError])):
+        if training.records:
+            plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+        if histograms := training.log.history.histograms():
+            plot_histograms(histograms, folder / files.HISTOGRAMS)
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
