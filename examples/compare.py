@@ -83,7 +83,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         check_free(options.overrides)
         options.arms = parse_arms(options.arm)
         files.check_folder(options.folder)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         parser.error(str(error))
     from torchrl_mpfa.checks import unknown
     from training.settings.train import GROUPS
@@ -154,4 +154,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

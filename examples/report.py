@@ -19,14 +19,13 @@ evaluation of each run, of which a higher score is better. Of these it writes ``
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import training.extra  # noqa: F401
 
 # isort: split
-from training.files import are_scores
+from training import files
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,13 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--output", type=Path, help="folder (default: that of the first path)")
     options = parser.parse_args(arguments)
+    try:
+        for path in options.paths:
+            files.check_name(path)
+    except ValueError as error:
+        parser.error(str(error))
     there = [path.resolve() for path in options.paths]
     for given, path in zip(options.paths, there, strict=True):
         if there.count(path) > 1:
             parser.error(f"{given} is named twice: its runs count once")
         if not path.exists():
             parser.error(f"there is no {given}")
-    kinds = {are_scores(path) for path in options.paths}
+    kinds = {files.are_scores(path) for path in options.paths}
     if len(kinds) > 1:
         parser.error("comparisons and tables of scores have reports of their own: name one kind")
     first = options.paths[0]
@@ -73,4 +77,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

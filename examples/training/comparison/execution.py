@@ -16,6 +16,7 @@ from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
 from training.comparison.options import JOBS
 from training.comparison.workers import LocalWorker, Lost, Worker
+from training.inherited import forget_single_run
 
 LOG = "output.log"
 """Output of the scripts, in the folder of a run."""
@@ -135,6 +136,7 @@ class Work(ABC, Generic[Item]):
 
     def run(self) -> Stop:
         """Make all items, some at a time; return how that was stopped."""
+        forget_single_run()
         stop = Stop("saving the runs; the same command continues them", write=tqdm.write)
         with stop.listening():
             try:
@@ -212,6 +214,8 @@ def make_runs(
     if a run failed, 128 and the number of the signal that stopped it.
     """
     jobs, wanted = comparison.jobs, comparison.evaluation
+    for job in jobs:
+        files.check_folder(job.path)
     with files.lock(comparison.folder):
         others = other_than_asked(jobs, comparison.settings)
         if others and not anew:
