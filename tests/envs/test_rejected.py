@@ -80,6 +80,10 @@ TASK: Rows = [
     ({"time_step": "1"}, "time_step must be a finite number, got '1'"),
     ({"time_step": None}, "time_step must be a finite number, got None"),
     ({"time_step": 0.6}, "time_step must be at most 0.5 s, .*collision_distance = 0.25 .*got 0.6"),
+    (
+        {"robot": replace(ROBOTS["burger"], min_wheel_speed=-2.0), "time_step": 0.2},
+        "time_step must be at most 0.[0-9]+ s, .*at its fastest, got 0.2",
+    ),
     ({"goal_radius": math.nan}, "goal_radius must be a finite number, got nan"),
     ({"min_goal_distance": 0.3}, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
     ({"closeness_distance": 0.0}, "closeness_distance must be positive, got 0.0"),
