@@ -24,6 +24,7 @@ from pathlib import Path
 import training.extra  # noqa: F401
 
 # isort: split
+from training import files
 from training.finished import after_the_end, is_finished
 
 
@@ -40,7 +41,8 @@ def main() -> None:
             raise SystemExit(2) from None
         return
     only, _, folder = "".join(arguments).partition("resume=")
-    if len(arguments) == 1 and not only and is_finished(Path(folder)):
+    is_drawn = (Path(folder) / files.CURVE).exists()
+    if len(arguments) == 1 and not only and is_drawn and is_finished(Path(folder)):
         print(after_the_end(Path(folder)))
         raise SystemExit(0)
     # Imports PyTorch, Hydra and wandb, which takes seconds.

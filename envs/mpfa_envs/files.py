@@ -36,7 +36,9 @@ def check_replaceable(
 
 def write_atomically(content: bytes, path: Path) -> None:
     """Write a file in one step: the old one or the new one, never half."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
+    with tempfile.NamedTemporaryFile(
+        dir=path.parent, prefix=f".{path.name}.", suffix=".tmp", delete=False
+    ) as new:
         try:
             new.write(content)
             new.flush()

@@ -152,13 +152,16 @@ def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) 
             check_settings(settings)
             before = as_settings(state["settings"])
             check_lawful(before, settings, folder)
-            if is_finished(folder) and settings.curriculum.stages == before.curriculum.stages:
+            is_drawn = (folder / files.CURVE).exists() or not state["records"]
+            longer = settings.curriculum.stages != before.curriculum.stages
+            if is_finished(folder) and is_drawn and not longer:
                 print(after_the_end(folder))
                 return 0
             prepare_process(settings)
             training = TrainingRun(settings, folder, state, hooks)
-            # A finished run that gets more episodes is unfinished.
-            (folder / files.STATUS).unlink(missing_ok=True)
+            # A finished run that gets more episodes is unfinished, and its curve is too short.
+            for name in (files.STATUS, files.CURVE):
+                (folder / name).unlink(missing_ok=True)
             write_settings(settings, folder / files.SETTINGS)
         return _train(training)
 
@@ -207,10 +210,11 @@ def _train(training: TrainingRun) -> int:
     from training.figures import plot_learning_curve
 
     curve = folder / files.CURVE
-    if training.records:
-        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
     if histograms := training.log.history.histograms():
         plot_histograms(histograms, folder / files.HISTOGRAMS)
+    # Last: a finished run without its curve draws both when it resumes.
+    if training.records:
+        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:

@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_module
 import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
-from training import files
+from training import figures, files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.finished import after_the_end
@@ -84,6 +84,25 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert not job.is_trained()
 
 
+def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    begin(tmp_path, episodes=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "plot_learning_curve", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            go_on(tmp_path, STAGES.format(2))
+    assert not (tmp_path / files.CURVE).exists()
+    policy = (tmp_path / files.POLICY).read_bytes()
+    monkeypatch.setattr(sys, "argv", ["train.py", f"resume={tmp_path}"])
+    train.main()
+    assert (tmp_path / files.CURVE).exists()
+    assert (tmp_path / files.POLICY).read_bytes() == policy
+
+
 def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,10 +136,11 @@ def test_a_second_run_in_the_same_folder_is_rejected_while_the_first_is_at_work(
 
 
 def test_what_a_killed_save_left_is_removed(tmp_path: Path) -> None:
-    for name in (f".{CHECKPOINT}.99999.tmp", f".{files.POLICY}.x1y2", f".{files.EPISODES}.7.tmp"):
+    for name in (f".{CHECKPOINT}.99.tmp", f".{files.POLICY}.x1.tmp", f"{files.CSV}/.a.csv.7.tmp"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"half")
     begin(tmp_path, episodes=1)
-    assert {path.name for path in tmp_path.glob(".*")} == {".lock"}
+    assert {path.name for path in tmp_path.rglob(".*")} == {".lock"}
 
 
 def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path) -> None:
