@@ -128,7 +128,11 @@ MANY: Rows = [
     ({"world": "rooms", "difficulty": 1.5}, r"difficulty must be in \[0, 1\], got 1.5"),
     ({"episodes_per_world": 0}, "episodes_per_world must be a positive integer, got 0"),
     ({"split": "test"}, "split must be 'train' or 'validation', got 'test'"),
-    ({"max_goal_distance": 1.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+    ({"max_goal_distance": 2.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+    (
+        {"min_goal_distance": 0.7, "max_goal_distance": True},
+        "max_goal_distance must be above min_goal_distance = 0.7, got True",
+    ),
     ({"autoreset_mode": "Never"}, "autoreset_mode must be .*got 'Never'"),
     ({"min_goal_distance": 40.0}, "world 'A' has no start and goal at least"),
     ({"world": World(name="box", size=(0.9, 0.9))}, "world 'box' has no free goal"),
