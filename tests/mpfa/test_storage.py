@@ -255,7 +255,7 @@ def test_rewards_that_are_not_one_finite_number_are_rejected_before_the_write(ro
 def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
     bad = Signal("bad", key=("next", "reward"), known_at="write", priority=torch.neg)
     storage = SignalTensorStorage(4, signals=["td_error", bad])
-    with pytest.raises(ValueError, match=r"signal 'bad' must not be negative, got -1.0"):
+    with pytest.raises(ValueError, match=r"signal 'bad' must be finite and not negative, got -1.0"):
         storage.set(torch.arange(1), make_transitions(1, rewards=[1.0]))
     assert len(storage) == 0
 

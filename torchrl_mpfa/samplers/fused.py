@@ -96,7 +96,6 @@ class SignalSampler(TreeSampler):
         entropy_refresh: float = 1 / 256,
         **kwargs: Any,
     ) -> None:
-        check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
         if not isinstance(self.fusion, Fusion):
@@ -109,7 +108,7 @@ class SignalSampler(TreeSampler):
         for adjust in self.adjustments:
             if not callable(adjust):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
-        self.entropy_refresh = entropy_refresh
+        self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self._counting = [counts_buffer(each) for each in self.adjustments]
         self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]

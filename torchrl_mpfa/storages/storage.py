@@ -6,6 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from types import MappingProxyType
 from typing import Any
 
@@ -17,8 +18,8 @@ from torch import Tensor
 from torchrl_mpfa.checks import as_mask, check_counts, generator_on
 from torchrl_mpfa.saving import check_saved, load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
-from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
-from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, as_index, check_finite_entries
+from torchrl_mpfa.storages.table import SignalTable, allocate
 
 _FORMAT = 1
 _FILE = "signals.pt"
@@ -71,7 +72,7 @@ class SignalStorageMixin:
         allow_nonfinite: Sequence[NestedKey] = (),
         **kwargs: Any,
     ) -> None:
-        check_counts(max_size=max_size)
+        max_size = check_counts(max_size=max_size)
         self._allow_nonfinite = tuple(allow_nonfinite)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key, **self._mapped)
         super().__init__(max_size, **kwargs)  # type: ignore[call-arg]
@@ -115,13 +116,14 @@ class SignalStorageMixin:
 
     def get(self, index: Any) -> Any:
         """Read transitions; all slots come as a tensordict that shares their tensors."""
-        found = super().get(index)  # type: ignore[misc]
+        found = super().get(as_index(index))  # type: ignore[misc]
         # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
         own = found is self._storage and isinstance(found, TensorDictBase)  # type: ignore[attr-defined]
         return found.copy() if own else found
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Write transitions and reset the signals of their slots, or raise as :meth:`check`."""
+        cursor = as_index(cursor)
         rows, pairs = self.check(_as_batch(data))
         size = len(self)  # type: ignore[arg-type]
         try:
@@ -279,8 +281,12 @@ class SignalStorageMixin:
         self._settle_loaded(signals)
 
     def dumps(self, path: str | Path) -> None:
-        """Save data and signals in a folder, with a checksum of each of its files."""
+        """Save data and signals in a folder, with checksums, or raise ``OSError`` if it is full."""
         path = Path(path)
+        path.mkdir(exist_ok=True)
+        if is_tensor_collection(data := self._storage):  # type: ignore[attr-defined]
+            with NamedTemporaryFile(dir=path) as room:  # TorchRL asks for none.
+                allocate(room.name, data.bytes())
         super().dumps(path)  # type: ignore[misc]
         state = {"_signals": self.signal_table.state_dict(), "_signals_format": _FORMAT}
         save_atomically(state, path / _FILE)

@@ -317,6 +317,19 @@ def signal_table_of(storage: object, signals: Sequence[Signal], capacity: int) -
     return table
 
 
+def allocate(path: str | Path, size: int = 0) -> None:
+    """Reserve room on the disk for a file that is mapped to memory, or raise ``OSError``.
+
+    A write to a mapped file for which the disk has no room would kill the process.
+    """
+    with open(path, "r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size or os.path.getsize(path) or 1)
+        except OSError as error:
+            error.filename = str(path)
+            raise
+
+
 def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.float64]:
     """Map numbers to a file, which is locked as long as they are in use."""
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -334,6 +347,7 @@ def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.fl
                 f"{file} is there from an earlier storage: pass existsok=True to overwrite it"
             )
         opened.truncate(0)
+        allocate(file, 8 * math.prod(shape))
         return np.memmap(opened, dtype=np.float64, mode="w+", shape=shape)
 
 
@@ -359,7 +373,5 @@ def _not_negative(signal: Signal, value: Tensor) -> Tensor:
     priority = (signal.priority or torch.abs)(value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):
-        wanted = "be finite" if low >= 0 else "not be negative"
-        bad = priority[~((priority >= 0) & (priority < math.inf))][0].item()
-        raise ValueError(f"signal {signal.name!r} must {wanted}, got {bad}")
+        check_finite(f"signal {signal.name!r}", priority)
     return priority

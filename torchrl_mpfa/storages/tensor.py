@@ -9,11 +9,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import bounds
 from torchrl_mpfa.storages.storage import SignalStorageMixin
+from torchrl_mpfa.storages.table import allocate
 
 
 class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
@@ -85,6 +86,7 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
     Raises:
         FileExistsError: If ``scratch_dir`` holds the files of an earlier storage and ``existsok``
             is false, or a living storage, of this process or another, uses it.
+        OSError: If the disk has no room for the files, at the first write too; nothing is stored.
 
     Examples:
         >>> import tempfile
@@ -106,6 +108,20 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         if scratch_dir is not None:
             self._mapped = {"file": Path(scratch_dir) / "signals.memmap", "existsok": existsok}
         super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
+
+    def _init(self, data: Any) -> None:
+        super()._init(data)
+        entries = tree_leaves(self._storage)
+        files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
+        try:
+            for file in files:
+                allocate(file)
+        except OSError:
+            self._storage, self.initialized = None, False
+            for entry in entries:
+                if entry._filename is not None:
+                    Path(entry._filename).unlink()
+            raise
 
     def __getstate__(self) -> Any:
         state = super().__getstate__()

@@ -19,6 +19,7 @@ from hydra import compose, initialize_config_module
 import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
+from torchrl_mpfa.stopping import SIGNALS
 from training import figures, files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
@@ -370,7 +371,7 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
 
 
 @pytest.mark.parametrize(
-    "number", mostly_slow([signal.SIGINT, signal.SIGTERM, signal.SIGHUP], [signal.SIGTERM])
+    "number", mostly_slow([*SIGNALS], [signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2])
 )
 def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
