@@ -52,7 +52,7 @@ SETTINGS = [
 """A run of 60 iterations, in which the replay memory is filled and written over."""
 PHASES = ("start", "drive", "write", "update", "evaluation", "checkpoint", "pictures", "charts")
 SHOWN = ("pictures", "charts")
-"""Phases that take most of the time; a run that is not stopped in one of them has neither."""
+"""Phases that take most of the time; a run that is not to be stopped in one of them lacks it."""
 KINDS = {"SIGKILL": 100, "SIGTERM": 50, "SIGINT": 50, "SIGUSR1": 50, "disk": 20}
 """Kinds of stops, with their trials."""
 _BETWEEN = len(PHASES)
@@ -100,18 +100,18 @@ def watch(seen: memoryview, pipe: int) -> None:
 class Child:
     """``train.py`` in a child that writes to ``FOLDER.log`` and keeps scratch in ``FOLDER.tmp``."""
 
-    def __init__(self, folder: Path, *, shown: bool, resume: bool = False) -> None:
+    def __init__(self, folder: Path, *shown: str, resume: bool = False) -> None:
         self.seen = memoryview(mmap.mmap(-1, 16)).cast("q")
         self.seen[0] = _BETWEEN
         self.pipe, pipe = os.pipe()
-        words = [f"resume={folder}"] if resume else begin(folder, shown=shown)
+        words = [f"resume={folder}"] if resume else begin(folder, *shown)
         self.process = os.fork()
         if not self.process:
             signal.alarm(_PATIENCE)
-            self._run(folder, words, shown, pipe)
+            self._run(folder, words, "charts" in shown, pipe)
         os.close(pipe)
 
-    def _run(self, folder: Path, words: list[str], shown: bool, pipe: int) -> None:
+    def _run(self, folder: Path, words: list[str], drawn: bool, pipe: int) -> None:
         status: Any = 1
         try:
             log = os.open(f"{folder}.log", os.O_CREAT | os.O_WRONLY | os.O_APPEND)
@@ -119,7 +119,7 @@ class Child:
             os.dup2(log, 2)
             tempfile.tempdir = f"{folder}.tmp"
             os.makedirs(tempfile.tempdir, exist_ok=True)
-            if not shown:
+            if not drawn:
                 figures.plot_learning_curve = charts.plot_histograms = lambda *arguments: None
             watch(self.seen, pipe)
             script.train(words)
@@ -145,9 +145,10 @@ class Child:
         return os.waitstatus_to_exitcode(status)
 
 
-def begin(folder: Path, *, shown: bool) -> list[str]:
+def begin(folder: Path, *shown: str) -> list[str]:
     """Command line of a run."""
-    return [*SETTINGS, f"tracking.pictures_every={150 if shown else 'null'}", f"run_dir={folder}"]
+    pictures = 0 if "pictures" in shown else "null"
+    return [*SETTINGS, f"tracking.pictures_every={pictures}", f"run_dir={folder}"]
 
 
 def durations_of(child: Child) -> list[list[float]]:
@@ -203,13 +204,14 @@ def content(folder: Path) -> dict[str, bytes]:
 def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str, bytes]) -> Any:
     """Stop a run, resume it, and return a row of what was found."""
     rng, aim = np.random.default_rng((*KINDS,).index(kind) * 1000 + trial), trial % len(PHASES)
-    shown = PHASES[aim] in SHOWN
+    # What a run draws on a full disk is part of its end, wherever that is.
+    shown = (PHASES[aim], "charts") if kind == "disk" else (PHASES[aim],)
     while True:  # Until the moment is before the end, and the disk is needed after it.
         occurrence = int(rng.integers(len(durations[aim])))
         delay, free = float(rng.random()) * durations[aim][occurrence], int(rng.integers(1 << 19))
         with _disk(kind) as (place, fill):
             folder = place / "run"
-            child = Child(folder, shown=shown)
+            child = Child(folder, *shown)
             for change in child.changes():
                 occurrence -= change == aim
                 if occurrence < 0:
@@ -229,10 +231,10 @@ def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str
             row["traceback"] = "Traceback" in Path(f"{folder}.log").read_text()
             row["actions"], row["lost"] = child.seen[1], child.seen[1] - state["actions"]
             row["damaged"], row["scratch"] = damaged(folder), len(os.listdir(f"{folder}.tmp"))
-            row["resumed"] = Child(folder, shown=shown, resume=saved).wait()
+            row["resumed"] = Child(folder, *shown, resume=saved).wait()
             after = content(folder) if row["resumed"] == 0 else {}
             row["differs"] = " ".join(n for n in expected if after.get(n) != expected[n])
-            wanted = (files.CURVE, files.HISTOGRAMS) if shown else ()
+            wanted = (files.CURVE, files.HISTOGRAMS) if "charts" in shown else ()
             row["missing"] = " ".join(name for name in wanted if not (folder / name).exists())
             return row | {"damaged_after": damaged(folder)}
 
@@ -292,8 +294,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if trials:
             # The run of this process compiles all; runs of its children must equal it.
             first, whole = Path(place, "first"), Path(place, "whole")
-            script.train(begin(first, shown=True))
-            child, expected = Child(whole, shown=True), content(first)
+            script.train(begin(first, *SHOWN))
+            child, expected = Child(whole, *SHOWN), content(first)
             durations = durations_of(child)
             if child.wait() or content(whole) != expected:
                 raise RuntimeError("a run of a child differs from that of a new process")
