@@ -25,7 +25,7 @@ from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.finished import after_the_end
 from training.records import read_table
-from training.run import checkpoints, hooks
+from training.run import checkpoints, hooks, script
 from training.run.checkpoints import read_checkpoint, save
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, resume, start
@@ -102,6 +102,16 @@ def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
     train.main()
     assert (tmp_path / files.CURVE).exists()
     assert (tmp_path / files.POLICY).read_bytes() == policy
+
+
+def test_a_finished_run_without_an_episode_has_no_curve_and_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin(tmp_path, "curriculum.stages=[{world: A, actions: 2}]")
+    assert not (tmp_path / files.CURVE).exists()
+    monkeypatch.setattr(script, "TrainingRun", None)
+    assert go_on(tmp_path) == 0
+    assert "is finished, after 2 actions" in capsys.readouterr().out
 
 
 def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
