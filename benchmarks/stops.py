@@ -83,7 +83,8 @@ def watch(seen: memoryview, pipe: int) -> None:
         counted(schedule, **numbers)
         seen[1] = schedule.actions
 
-    counted, Schedule.count = Schedule.count, count  # type: ignore[method-assign]
+    counted = Schedule.count
+    Schedule.count = count  # type: ignore[method-assign, assignment]
     in_phase("start", TrainingRun, "__init__")
     in_phase("start", script, "write_settings")
     in_phase("drive", TrainingRun, "_iterate")
@@ -98,7 +99,7 @@ def watch(seen: memoryview, pipe: int) -> None:
 
 
 class Child:
-    """``train.py`` in a child that writes to ``FOLDER.log`` and keeps scratch in ``FOLDER.tmp``."""
+    """``train.py`` in a child; its output and its scratch files lie two folders above the run."""
 
     def __init__(self, folder: Path, *shown: str, resume: bool = False) -> None:
         self.seen = memoryview(mmap.mmap(-1, 16)).cast("q")
@@ -114,13 +115,14 @@ class Child:
     def _run(self, folder: Path, words: list[str], drawn: bool, pipe: int) -> None:
         status: Any = 1
         try:
-            log = os.open(f"{folder}.log", os.O_CREAT | os.O_WRONLY | os.O_APPEND)
+            log = os.open(folder.parents[1] / "log", os.O_CREAT | os.O_WRONLY | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            tempfile.tempdir = f"{folder}.tmp"
+            tempfile.tempdir = str(folder.parents[1] / "scratch")
             os.makedirs(tempfile.tempdir, exist_ok=True)
             if not drawn:
-                figures.plot_learning_curve = charts.plot_histograms = lambda *arguments: None
+                for module, name in (figures, "plot_learning_curve"), (charts, "plot_histograms"):
+                    setattr(module, name, lambda *arguments: None)
             watch(self.seen, pipe)
             script.train(words)
             status = 0
@@ -210,7 +212,7 @@ def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str
         occurrence = int(rng.integers(len(durations[aim])))
         delay, free = float(rng.random()) * durations[aim][occurrence], int(rng.integers(1 << 19))
         with _disk(kind) as (place, fill):
-            folder = place / "run"
+            folder = place / "disk/run"
             child = Child(folder, *shown)
             for change in child.changes():
                 occurrence -= change == aim
@@ -228,9 +230,9 @@ def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str
             saved = (folder / files.CHECKPOINT).exists()
             state = load_safely(folder / files.CHECKPOINT)["schedule"] if saved else {"actions": 0}
             row = {"kind": kind, "trial": trial, "phase": phase, "status": status, "saved": saved}
-            row["traceback"] = "Traceback" in Path(f"{folder}.log").read_text()
+            row["traceback"] = "Traceback" in (place / "log").read_text()
             row["actions"], row["lost"] = child.seen[1], child.seen[1] - state["actions"]
-            row["damaged"], row["scratch"] = damaged(folder), len(os.listdir(f"{folder}.tmp"))
+            row["damaged"], row["scratch"] = damaged(folder), len(os.listdir(place / "scratch"))
             row["resumed"] = Child(folder, *shown, resume=saved).wait()
             after = content(folder) if row["resumed"] == 0 else {}
             row["differs"] = " ".join(n for n in expected if after.get(n) != expected[n])
@@ -241,22 +243,24 @@ def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str
 
 @contextmanager
 def _disk(kind: str) -> Iterator[tuple[Path, Callable[[int | None], None]]]:
-    """Yield a new folder, and what leaves so many bytes of its disk free, or None for all."""
+    """Yield a new folder, and what leaves so many bytes free in its ``disk``, or None for all."""
 
     def fill(free: int | None) -> None:
         if kind == "disk":
-            size = _DISK if free is None else shutil.disk_usage(place).used + free
-            subprocess.run(["mount", "-o", f"remount,size={size}", place], check=True)
+            size = _DISK if free is None else shutil.disk_usage(disk).used + free
+            subprocess.run(["mount", "-o", f"remount,size={size}", disk], check=True)
 
     with tempfile.TemporaryDirectory(prefix="stop-") as place:
+        disk = Path(place, "disk")
+        disk.mkdir()
         if kind == "disk":
-            subprocess.run(["mount", "-t", "tmpfs", "none", place], check=True)
+            subprocess.run(["mount", "-t", "tmpfs", "none", disk], check=True)
         try:
             fill(None)
             yield Path(place), fill
         finally:
             if kind == "disk":
-                subprocess.run(["umount", place], check=True)
+                subprocess.run(["umount", disk], check=True)
 
 
 def report(rows: pd.DataFrame) -> str:
@@ -293,13 +297,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(prefix="stops-") as place:
         if trials:
             # The run of this process compiles all; runs of its children must equal it.
-            first, whole = Path(place, "first"), Path(place, "whole")
+            first, whole = Path(place, "first"), Path(place, "whole/run")
             script.train(begin(first, *SHOWN))
             child, expected = Child(whole, *SHOWN), content(first)
             durations = durations_of(child)
             if child.wait() or content(whole) != expected:
                 raise RuntimeError("a run of a child differs from that of a new process")
-        for kind, trial in sorted(trials, key=lambda t: ((*KINDS,).index(t[0]), t[1])):
+        for kind, trial in sorted(trials, key=lambda t: (t[1], t[0])):
             row = make(kind, trial, durations, expected)
             rows = pd.concat([rows, pd.DataFrame([row])], ignore_index=True)
             write_table(rows, chosen.rows)

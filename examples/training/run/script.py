@@ -201,6 +201,7 @@ def _train(training: TrainingRun) -> int:
     folder, failure = training.folder, None
     try:
         finished = training.train()
+        _draw_charts(training)
     except KeyboardInterrupt:
         # An earlier signal asked to save first; this one ends the run.
         training.stop.signal = training.stop.signal or signal.SIGINT
@@ -212,20 +213,10 @@ def _train(training: TrainingRun) -> int:
         finished = False
     finally:
         training.close()
-    # Charts are made of tables and by matplotlib, which take a second to import.
-    from mpfa_envs.render.charts import plot_histograms
-    from training.figures import plot_learning_curve
-
-    curve = folder / files.CURVE
-    if histograms := training.log.history.histograms():
-        plot_histograms(histograms, folder / files.HISTOGRAMS)
-    # Last: a finished run without its curve draws both when it resumes.
-    if training.records:
-        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
-        print(f"policy: {folder / files.POLICY}   curve: {curve}")
+        print(f"policy: {folder / files.POLICY}   curve: {folder / files.CURVE}")
         return 0
     saved = (folder / files.CHECKPOINT).exists()
     plugin = training.settings.plugin
@@ -235,6 +226,20 @@ def _train(training: TrainingRun) -> int:
         print(f"train.py: {failure}", file=sys.stderr)
     print(f"stopped after {training.actions} actions; {how}")
     return training.stop.exit_status if failure is None else 1
+
+
+def _draw_charts(training: TrainingRun) -> None:
+    """Draw the chart of the priorities and the learning curve of a run."""
+    # Charts are made of tables and by matplotlib, which take a second to import.
+    from mpfa_envs.render.charts import plot_histograms
+    from training.figures import plot_learning_curve
+
+    if histograms := training.log.history.histograms():
+        plot_histograms(histograms, training.folder / files.HISTOGRAMS)
+    # Last: a finished run without its curve draws both when it resumes.
+    if training.records:
+        table = as_table(training.records, EpisodeRecord)
+        plot_learning_curve(table, training.folder / files.CURVE)
 
 
 def write_settings(settings: TrainSettings, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -94,14 +95,26 @@ def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
     begin(tmp_path, episodes=1)
     with monkeypatch.context() as patch:
         patch.setattr(figures, "plot_learning_curve", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            go_on(tmp_path, STAGES.format(2))
+        assert go_on(tmp_path, STAGES.format(2)) == 128 + signal.SIGINT
     assert not (tmp_path / files.CURVE).exists()
     policy = (tmp_path / files.POLICY).read_bytes()
     monkeypatch.setattr(sys, "argv", ["train.py", f"resume={tmp_path}"])
     train.main()
     assert (tmp_path / files.CURVE).exists()
     assert (tmp_path / files.POLICY).read_bytes() == policy
+
+
+def test_a_disk_without_room_for_charts_ends_a_run_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left", str(tmp_path / files.CURVE))
+
+    monkeypatch.setattr(figures, "plot_learning_curve", full)
+    assert begin(tmp_path, episodes=1) == 1
+    printed = capsys.readouterr()
+    assert printed.err.splitlines()[-1].startswith(f"train.py: {tmp_path / files.CURVE} cannot be")
+    assert f"continue with: train.py resume={tmp_path}" in printed.out
 
 
 def test_a_finished_run_without_an_episode_has_no_curve_and_is_not_trained_again(
