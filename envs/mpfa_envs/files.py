@@ -48,6 +48,6 @@ def write_atomically(content: bytes, path: Path) -> None:
             os.replace(new.name, path)
         except BaseException as error:
             os.unlink(new.name)
-            if isinstance(error, OSError):
+            if isinstance(error, OSError) and error.errno:
                 error.filename = str(path)
             raise
