@@ -30,7 +30,7 @@ COUNT_OR_ZERO: Rule = (
     "an integer from 0 to 2147483646",
 )
 LEVEL: Rule = (
-    lambda value: value == "mean" or (not isinstance(value, bool | str) and math.isfinite(value)),
+    lambda x: x == "mean" or (not isinstance(x, bool | str | None) and math.isfinite(x)),
     "a finite number or 'mean'",
 )
 

@@ -375,6 +375,27 @@ def test_a_killed_run_goes_on_and_signals_save(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_run_whose_disk_is_full_says_so_in_one_line_and_how_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
+
+    def train_on(run: TrainingRun) -> bool:
+        save(run)
+        run.records = [object()]  # type: ignore[list-item]
+        full()
+        return True
+
+    monkeypatch.setattr(TrainingRun, "train", train_on)
+    monkeypatch.setattr("training.run.script.as_table", full)
+    assert begin(tmp_path) == 1
+    out, err = capsys.readouterr()
+    words = "checkpoint.pt cannot be written, No space left on device: free some of its disk"
+    assert err.splitlines()[-1] == f"train.py: {words}"
+    assert f"continue with: train.py resume={tmp_path}" in out
+
+
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
     saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
