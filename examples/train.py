@@ -43,7 +43,8 @@ def main() -> None:
             raise SystemExit(2) from None
         return
     only, _, folder = "".join(arguments).partition("resume=")
-    if len(arguments) == 1 and not only and is_finished(Path(folder)):
+    is_drawn = (Path(folder) / files.CURVE).exists()
+    if len(arguments) == 1 and not only and is_drawn and is_finished(Path(folder)):
         print(after_the_end(Path(folder)))
         raise SystemExit(0)
     # The parts of a run take seconds to import: what is misspelt is answered before.

@@ -42,7 +42,9 @@ def check_replaceable(
 
 def write_atomically(content: bytes, path: Path) -> None:
     """Write a file in one step: the old one or the new one, never half."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
+    with tempfile.NamedTemporaryFile(
+        dir=path.parent, prefix=f".{path.name}.", suffix=".tmp", delete=False
+    ) as new:
         try:
             new.write(content)
             new.flush()
@@ -52,6 +54,6 @@ def write_atomically(content: bytes, path: Path) -> None:
             os.replace(new.name, path)
         except BaseException as error:
             os.unlink(new.name)
-            if isinstance(error, OSError):
+            if isinstance(error, OSError) and error.errno:
                 error.filename = str(path)
             raise

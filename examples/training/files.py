@@ -133,9 +133,9 @@ def lock(folder: Path) -> Iterator[None]:
     except Timeout:
         raise FolderInUse(f"another process is using {folder}: wait for it, or stop it") from None
     try:
-        for pattern in (".*.tmp", f".{POLICY}.*"):
-            for half_written in folder.glob(pattern):
-                half_written.unlink(missing_ok=True)
+        # Not in the folders of a comparison's runs, each of which has a lock of its own.
+        for half_written in (*folder.glob(".*.tmp"), *(folder / CSV).rglob(".*.tmp")):
+            half_written.unlink(missing_ok=True)
         yield
     finally:
         held.release()

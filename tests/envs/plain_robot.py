@@ -14,7 +14,10 @@ from tests.envs.shapes import distance
 class PlainRobot:
     """Motion on exact arcs, lidar, observation, Eq. (25) and the ends of an episode."""
 
-    def __init__(self, world: World, task: Task, config: TaskConfig) -> None:
+    def __init__(
+        self, world: World, task: Task, config: TaskConfig, *, step_cost: float = 0.0
+    ) -> None:
+        self.step_cost = step_cost
         self.world, self.goal, self.config = world, task.goal, config
         self.lidar = config.make_lidar(world)
         x, y, heading = task.start
@@ -55,7 +58,7 @@ class PlainRobot:
         self.timeout = not ended and self.steps >= self.config.max_steps
         self.over = ended or self.timeout
         approach = self.config.progress_scale * (far - self.distance)  # Eq. (25)
-        return 10.0 if self.success else -5.0 if self.collision else approach
+        return 10.0 if self.success else -5.0 if self.collision else approach - self.step_cost
 
     def observe(self) -> np.ndarray:
         """The observation, ``[O]``."""

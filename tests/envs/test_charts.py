@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from scipy import stats
 
@@ -32,6 +35,22 @@ def test_a_band_is_the_interval_of_the_mean_of_runs() -> None:
     np.testing.assert_allclose(mean, values.mean(0))
     np.testing.assert_allclose(low, expected.low)
     np.testing.assert_allclose(high, expected.high)
+
+
+def test_a_chart_that_cannot_be_written_whole_leaves_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left")
+
+    path = tmp_path / "seeds.png"
+    plot_seeds({"one": [(STEPS, STEPS)]}, path)
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="no space left"):
+        plot_seeds({"two": [(STEPS, -STEPS)]}, path)
+    assert path.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [path]
 
 
 def test_a_mean_spans_the_steps_that_all_runs_have() -> None:

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from mpfa_envs import Box, Lidar, NavigationEnv, VectorNavigationEnv, World, generate_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
-from mpfa_envs.sensing.map_loops import BLOCKED
+from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.paper import drive_to_end
@@ -87,6 +87,28 @@ def test_the_path_is_the_cheapest_after_every_scan(seed: int) -> None:
         assert path[2] == pytest.approx(cheapest(levels, end)[cell] * RESOLUTION / 10)
         assert math.hypot(path[0], path[1]) == pytest.approx(1.0)
         pose += [rng.uniform(0.0, 0.6), rng.uniform(0.0, 0.5), rng.uniform(-0.5, 0.5)]
+
+
+def test_a_path_through_a_tight_gap_costs_more_than_one_near_a_wall() -> None:
+    half = ROBOT.radius + 0.04  # Of a gap in which the rim is 4 cm from either side.
+    world = World(
+        name="gap",
+        size=(6.1, 4.1),  # An odd number of cells, one of which has its center at zero.
+        boxes=(Box(0.9, half, 1.1, 2.05), Box(0.9, -2.05, 1.1, -half)),
+    )
+    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
+    memory.begin(0, world)
+    for side, heading in ((2.0, 0.0), (0.0, 0.0)):  # Both sides of the wall are seen.
+        path = scan(memory, lidar, (side, 0.0, heading), (2.0, 0.0))
+    origin = memory.arrays.origins[0]
+    start, end, gap = (
+        tuple(np.rint((np.array(at) - origin) / RESOLUTION).astype(int))
+        for at in ((0.0, 0.0), (2.0, 0.0), (1.0, 0.0))
+    )
+    levels = memory.arrays.levels[0]
+    assert levels[gap] == TIGHT
+    assert path[2] == pytest.approx(cheapest(levels, end)[start] * RESOLUTION / 10)
+    assert path[2] > 6.0  # Were a tight cell as cheap as one near a wall: 2 m at three times.
 
 
 def test_the_path_leads_straight_to_a_visible_goal() -> None:

@@ -52,3 +52,10 @@ def test_state_of_an_environment_with_numbers_of_numpy_has_none():
     env.reset(seed=int(ONE), options={"worlds": [world, None]})
     assert numbers_of_numpy(env.state_dict()) == []
     env.close()
+
+
+def test_state_of_generated_worlds_of_a_difficulty_of_numpy_has_none():
+    env = VectorNavigationEnv(1, world="bars", physics="kinematic", difficulty=HALF)
+    env.reset(seed=0)
+    assert numbers_of_numpy(env.state_dict()) == []
+    env.close()

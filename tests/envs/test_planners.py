@@ -161,6 +161,21 @@ def test_ants_give_the_best_path_of_all_iterations_without_loops() -> None:
     assert lengths == sorted(lengths, reverse=True)
 
 
+def test_ants_mark_the_iterations_path_and_the_best_so_far_in_turn() -> None:
+    grid, lengths = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25), []
+    places = np.stack((grid.xs[grid.cells[:, 0]], grid.ys[grid.cells[:, 1]]), axis=1)
+
+    class Recorded(AntColony):
+        def _mark(self, pheromone, neighbors, path) -> None:
+            lengths.append(float(np.hypot(*np.diff(places[path], axis=0).T).sum()))
+            super()._mark(pheromone, neighbors, path)
+
+    Recorded(ants=2, iterations=12, greed=0.3)(grid, (-4.0, -4.0), (4.0, 4.0))
+    best = np.minimum.accumulate(lengths)
+    np.testing.assert_array_equal(lengths[1::2], best[1::2])
+    assert (np.array(lengths[::2]) > best[::2]).any()
+
+
 def test_a_seed_of_the_ants_decides_their_path() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
     first, again, other = (

@@ -80,6 +80,10 @@ TASK: Rows = [
     ({"time_step": "1"}, "time_step must be a finite number, got '1'"),
     ({"time_step": None}, "time_step must be a finite number, got None"),
     ({"time_step": 0.6}, "time_step must be at most 0.5 s, .*collision_distance = 0.25 .*got 0.6"),
+    (
+        {"robot": replace(ROBOTS["burger"], min_wheel_speed=-2.0), "time_step": 0.2},
+        "time_step must be at most 0.[0-9]+ s, .*at its fastest, got 0.2",
+    ),
     ({"goal_radius": math.nan}, "goal_radius must be a finite number, got nan"),
     ({"min_goal_distance": 0.3}, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
     ({"closeness_distance": 0.0}, "closeness_distance must be positive, got 0.0"),
@@ -124,7 +128,11 @@ MANY: Rows = [
     ({"world": "rooms", "difficulty": 1.5}, r"difficulty must be in \[0, 1\], got 1.5"),
     ({"episodes_per_world": 0}, "episodes_per_world must be a positive integer, got 0"),
     ({"split": "test"}, "split must be 'train' or 'validation', got 'test'"),
-    ({"max_goal_distance": 1.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+    ({"max_goal_distance": 2.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+    (
+        {"min_goal_distance": 0.7, "max_goal_distance": True},
+        "max_goal_distance must be above min_goal_distance = 0.7, got True",
+    ),
     ({"autoreset_mode": "Never"}, "autoreset_mode must be .*got 'Never'"),
     ({"min_goal_distance": 40.0}, "world 'A' has no start and goal at least"),
     ({"world": World(name="box", size=(0.9, 0.9))}, "world 'box' has no free goal"),

@@ -151,10 +151,15 @@ def test_robots_that_share_a_server_part_slowly() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [{}, {"action_repeat": 3, "robot": "burger", "closeness_distance": 0.5}, PAPER_TASK],
+    ("arguments", "cost"),
+    [
+        ({}, 0.0),
+        ({"action_repeat": 3, "robot": "burger", "closeness_distance": 0.5}, 0.0),
+        ({"reward": partial(navigation_reward, step_cost=0.05)}, 0.05),
+        (PAPER_TASK, 0.0),
+    ],
 )
-def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict) -> None:
+def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict, cost: float) -> None:
     rng, worlds = np.random.default_rng(7), []
     while len(worlds) < 6:
         world = random_shapes(rng, boxes=3, cylinders=4, polygons=3)
@@ -163,7 +168,8 @@ def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict) -> 
     env = make(6, world=worlds, **{**arguments, "detour_chance": 0.0, "max_steps": 89})
     seen, _ = env.reset(seed=0)
     plain = [
-        PlainRobot(world, task, env.config) for world, task in zip(worlds, env.tasks, strict=True)
+        PlainRobot(world, task, env.config, step_cost=cost)
+        for world, task in zip(worlds, env.tasks, strict=True)
     ]
     np.testing.assert_allclose(seen, [each.observe() for each in plain], atol=1e-6)
     running, ends = np.ones(6, dtype=np.bool_), set()

@@ -8,6 +8,7 @@ from torchrl.data import ReplayBufferEnsemble
 from tests.mpfa.transitions import make_filled, make_transitions, write_signals
 from torchrl_mpfa.methods.assembly import make_replay
 from torchrl_mpfa.samplers import TreeSampler
+from torchrl_mpfa.samplers.trees import as_slots
 
 NO_INTEGERS = "index must hold integers, got"
 
@@ -16,6 +17,15 @@ def nested(slots):
     """An index as parts of an ensemble's batch have it."""
     slots = torch.as_tensor(slots)
     return TensorDict({"index": slots, "buffer_ids": torch.zeros_like(slots)}, slots.shape[:1])
+
+
+@pytest.mark.parametrize(
+    "index", [[], torch.empty(0), torch.empty(0, dtype=torch.bool), torch.empty(0, 2).long()]
+)
+def test_an_index_of_nothing_is_no_slot_in_any_form(index):
+    slots = as_slots(index)
+    assert slots.dtype is torch.long
+    assert slots.shape == (0,)
 
 
 def test_part_of_an_ensembles_batch_updates_the_priorities_of_its_rows():

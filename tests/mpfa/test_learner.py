@@ -80,6 +80,13 @@ def test_one_update_equals_adam_on_each_loss_alone():
         torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
 
 
+def test_actor_and_critic_learn_at_their_own_rates():
+    learner = make_learner(actor_lr=1e-4, critic_lr=2e-3)
+    rates = {id(p): g["lr"] for g in learner.optimizer.param_groups for p in g["params"]}
+    assert {rates[id(p)] for p in learner.loss.actor_parameters()} == {1e-4}
+    assert {rates[id(p)] for p in learner.loss.critic_parameters()} == {2e-3}
+
+
 def test_critic_is_not_moved_by_the_loss_of_the_actor():
     learner = make_learner(critic_weight_decay=0.0)
     of_critic = learner.loss.loss_value

@@ -25,6 +25,7 @@ from torchrl_mpfa import (
     PositiveDecay,
     SignalSampler,
 )
+from torchrl_mpfa.samplers.trees import last_of_each
 
 
 def priorities(buffer):
@@ -176,6 +177,13 @@ def test_of_slots_that_repeat_among_many_the_last_entry_counts_with_two_threads(
         assert priorities(buffer)[[*last]].tolist() == [*last.values()]
 
 
+def test_of_slots_that_repeat_among_many_the_last_position_is_found():
+    slots = torch.randint(500, (3000,), generator=seeded(1))
+    last = {slot: position for position, slot in enumerate(slots.tolist())}
+    assert last_of_each(slots).tolist() == [last[slot] for slot in sorted(last)]
+    assert last_of_each(torch.randperm(3000, generator=seeded(2))) is None
+
+
 def test_a_fresh_transition_gets_the_highest_priority_in_the_buffer_before_alpha():
     buffer = make_buffer(16)
     buffer.extend(make_transitions(4))
@@ -223,6 +231,18 @@ def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten
         asked.append(fusion.asked)
         buffer.add(make_transitions(1, first=16 + number)[0])
     assert asked == expected
+
+
+def test_the_refresh_is_a_share_of_the_transitions_and_not_of_the_capacity():
+    fusion = CountingFusion()
+    buffer = make_buffer(1000, fusion=fusion, entropy_refresh=0.25)
+    buffer.extend(make_transitions(8))
+    asked = []
+    for number in range(4):
+        buffer.update_tensordict_priority(write_signals(buffer.sample()))
+        asked.append(fusion.asked)
+        buffer.add(make_transitions(1, first=8 + number)[0])
+    assert asked == [1, 1, 1, 2]  # The third of eight transitions is more than a quarter.
 
 
 def test_a_refresh_of_zero_counts_at_every_update_even_if_nothing_was_written():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import TensorDictMaxValueWriter, TensorDictReplayBuffer
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
@@ -324,6 +324,20 @@ def test_rows_of_several_environments_in_turn_are_no_trajectory():
     buffer.extend(rows.transpose(0, 1).reshape(-1))
     with pytest.raises(RuntimeError, match="several environments go to a storage with ndim=2"):
         buffer.sample()
+
+
+def test_a_step_in_the_place_of_another_follows_no_older_one_without_observations():
+    storage, sampler = SignalTensorStorage(8), SignalSliceSampler(8, ALPHA, BETA, slice_len=2)
+    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+    buffer = make_buffer(8, 2, storage=storage, sampler=sampler, writer=writer)
+    reward = torch.tensor([1.0, 2, 3, 0, 4, 5, 6, 7]).unsqueeze(1)
+    after = {"reward": reward, "done": torch.zeros(8, 1, dtype=torch.bool)}
+    buffer.extend(TensorDict({"next": after}, [8]))
+    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == [True] * 7 + [False]
+    better = {"reward": torch.full((1, 1), 9.0), "done": torch.zeros(1, 1, dtype=torch.bool)}
+    assert buffer.extend(TensorDict({"next": better}, [1])).tolist() == [3]
+    joined = [True, True, False, False, True, True, True, False]
+    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == joined
 
 
 def test_a_batch_can_leave_the_ends_as_they_were_stored():

@@ -5,13 +5,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSliceSampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSliceSampler, SliceSampler
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
 from tests.mpfa.transitions import (
     make_buffer,
+    make_transitions,
     rejected,
+    restore,
     same,
     snapshot,
     train_rounds,
@@ -201,3 +203,26 @@ def test_torchrls_slices_are_sampled_from_our_storage(ndim):
     buffer.update_priority(index, torch.rand(ENVS * STEPS))
     steps = buffer.sample()["observation"].reshape(-1, 2)
     assert steps[:, 1].equal(steps[:, 0] + 1)
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+@pytest.mark.parametrize("way", ["state", "folder"])
+def test_torchrls_slices_of_a_loaded_ring_do_not_cross_its_newest_step(way, tmp_path):
+    first, second = (
+        make_buffer(
+            8,
+            200,
+            storage=SignalTensorStorage(8),
+            sampler=SliceSampler(slice_len=2, end_key=("next", "done"), strict_length=False),
+        )
+        for _ in range(2)
+    )
+    for number in range(11):  # Three steps of the second round, so that the newest has slot 2.
+        row = make_transitions(1, first=number)
+        row["next", "done"] = torch.zeros(1, 1, dtype=torch.bool)
+        first.extend(row)
+    restore(second, first, tmp_path if way == "folder" else None)
+    for buffer in (first, second):
+        steps = buffer.sample()["observation"].reshape(-1, 2)
+        assert steps[:, 1].equal(steps[:, 0] + 1)
+        assert steps[:, 0].unique().tolist() == [*range(3, 10)]

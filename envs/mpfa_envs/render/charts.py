@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import re
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.files import write_atomically
 from mpfa_envs.scene.colors import LINES, METHODS, VIRIDIS
 
 Array = NDArray[np.float64]
@@ -255,12 +257,14 @@ def new_figure(
 def finish(
     figure: Any, axes: Iterable[Any], path: str | os.PathLike[str], *, dpi: int = 120
 ) -> None:
-    """Give axes their grids, and write their figure to a PNG file whose folder is made."""
+    """Give axes their grids, and write their figure in one step to a file whose folder is made."""
     for axis in axes:
         axis.grid(alpha=0.3)
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=dpi)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=dpi, format=file.suffix[1:] or "png")
+    write_atomically(drawn.getvalue(), file)
 
 
 def look(place: int) -> dict[str, str]:

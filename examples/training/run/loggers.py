@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from torchrl_mpfa.saving import write_text_atomically
 from training import files
 
 Entry = float | torch.Tensor | NDArray[np.uint8] | Path
@@ -77,7 +78,7 @@ def forget_after(actions: int, path: Path) -> None:
     rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [row for row in rows if row.endswith("\n") and int(row.partition(",")[0]) <= actions]
     if kept != rows:
-        path.write_text("".join(kept), encoding="utf-8")
+        write_text_atomically("".join(kept), path)
 
 
 class TensorboardLog:

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -162,13 +162,16 @@ def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) 
             check_settings(settings)
             before = as_settings(state["settings"])
             check_lawful(before, settings, folder)
-            if is_finished(folder) and settings.curriculum.stages == before.curriculum.stages:
+            is_drawn = (folder / files.CURVE).exists() or not state["records"]
+            longer = settings.curriculum.stages != before.curriculum.stages
+            if is_finished(folder) and is_drawn and not longer:
                 print(after_the_end(folder))
                 return 0
             prepare_process(settings)
             training = TrainingRun(settings, folder, state, hooks)
-            # A finished run that gets more episodes is unfinished.
-            (folder / files.STATUS).unlink(missing_ok=True)
+            # A finished run that gets more episodes is unfinished, and its curve is too short.
+            for name in (files.STATUS, files.CURVE):
+                (folder / name).unlink(missing_ok=True)
             write_settings(settings, folder / files.SETTINGS)
         return _train(training)
 
@@ -201,6 +204,7 @@ def _train(training: TrainingRun) -> int:
     folder, failure = training.folder, None
     try:
         finished = training.train()
+        _draw_charts(training)
     except KeyboardInterrupt:
         # An earlier signal asked to save first; this one ends the run.
         training.stop.signal = training.stop.signal or signal.SIGINT
@@ -212,22 +216,11 @@ def _train(training: TrainingRun) -> int:
         finished = False
     finally:
         training.close()
-    # Charts are made of tables and by matplotlib, which take a second to import.
-    from mpfa_envs.render.charts import plot_histograms
-    from training.figures import plot_learning_curve
-
-    curve = folder / files.CURVE
-    # A disk that was full for the checkpoint is so for a chart.
-    with suppress(*([] if failure is None else [OSError])):
-        if training.records:
-            plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
-        if histograms := training.log.history.histograms():
-            plot_histograms(histograms, folder / files.HISTOGRAMS)
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
         made = (
-            f"   curve: {curve}"
+            f"   curve: {folder / files.CURVE}"
             if training.records
             else " (no episode has ended, and so there is no curve)"
         )
@@ -243,6 +236,20 @@ def _train(training: TrainingRun) -> int:
         print(f"train.py: {failure}", file=sys.stderr)
     print(f"stopped after {training.actions} actions; {how}")
     return training.stop.exit_status if failure is None else 1
+
+
+def _draw_charts(training: TrainingRun) -> None:
+    """Draw the chart of the priorities and the learning curve of a run."""
+    # Charts are made of tables and by matplotlib, which take a second to import.
+    from mpfa_envs.render.charts import plot_histograms
+    from training.figures import plot_learning_curve
+
+    if histograms := training.log.history.histograms():
+        plot_histograms(histograms, training.folder / files.HISTOGRAMS)
+    # Last: a finished run without its curve draws both when it resumes.
+    if training.records:
+        table = as_table(training.records, EpisodeRecord)
+        plot_learning_curve(table, training.folder / files.CURVE)
 
 
 def write_settings(settings: TrainSettings, path: Path) -> None:

@@ -21,12 +21,12 @@ import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
 from torchrl_mpfa.stopping import SIGNALS
-from training import files
+from training import figures, files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.finished import after_the_end
 from training.records import read_table
-from training.run import checkpoints, hooks
+from training.run import checkpoints, hooks, script
 from training.run.checkpoints import read_checkpoint, save
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, resume, start
@@ -86,6 +86,47 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert not job.is_trained()
 
 
+def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    begin(tmp_path, episodes=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "plot_learning_curve", interrupted)
+        assert go_on(tmp_path, STAGES.format(2)) == 128 + signal.SIGINT
+    assert not (tmp_path / files.CURVE).exists()
+    policy = (tmp_path / files.POLICY).read_bytes()
+    monkeypatch.setattr(sys, "argv", ["train.py", f"resume={tmp_path}"])
+    train.main()
+    assert (tmp_path / files.CURVE).exists()
+    assert (tmp_path / files.POLICY).read_bytes() == policy
+
+
+def test_a_disk_without_room_for_charts_ends_a_run_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left", str(tmp_path / files.CURVE))
+
+    monkeypatch.setattr(figures, "plot_learning_curve", full)
+    assert begin(tmp_path, episodes=1) == 1
+    printed = capsys.readouterr()
+    assert printed.err.splitlines()[-1].startswith(f"train.py: {tmp_path / files.CURVE} cannot be")
+    assert f"continue with: train.py resume={tmp_path}" in printed.out
+
+
+def test_a_finished_run_without_an_episode_has_no_curve_and_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin(tmp_path, "curriculum.stages=[{world: A, actions: 2}]")
+    assert not (tmp_path / files.CURVE).exists()
+    monkeypatch.setattr(script, "TrainingRun", None)
+    assert go_on(tmp_path) == 0
+    assert "is finished, after 2 actions" in capsys.readouterr().out
+
+
 def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,10 +160,11 @@ def test_a_second_run_in_the_same_folder_is_rejected_while_the_first_is_at_work(
 
 
 def test_what_a_killed_save_left_is_removed(tmp_path: Path) -> None:
-    for name in (f".{CHECKPOINT}.99999.tmp", f".{files.POLICY}.x1y2", f".{files.EPISODES}.7.tmp"):
+    for name in (f".{CHECKPOINT}.99.tmp", f".{files.POLICY}.x1.tmp", f"{files.CSV}/.a.csv.7.tmp"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"half")
     begin(tmp_path, episodes=1)
-    assert {path.name for path in tmp_path.glob(".*")} == {".lock"}
+    assert {path.name for path in tmp_path.rglob(".*")} == {".lock"}
 
 
 def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path) -> None:
