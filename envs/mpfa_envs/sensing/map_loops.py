@@ -280,7 +280,8 @@ def _look_ahead(
 @njit
 def _is_open(levels: NDArray[np.uint8], i: int, j: int, to_i: int, to_j: int) -> bool:
     """Return True if the line between two cells is no narrower than its ends."""
-    widest = max(levels[i, j], levels[to_i, to_j])
+    # From a blocked cell every line would be open, through walls too.
+    widest = min(max(levels[i, j], levels[to_i, to_j]), TIGHT)
     steps = max(abs(to_i - i), abs(to_j - j))
     for step in range(1, steps):
         at_i = math.floor(i + (to_i - i) * step / steps + 0.5)
