@@ -177,6 +177,16 @@ def test_what_is_too_near_may_be_passed_but_not_approached(gap: float) -> None:
     assert np.array_equal(keep(observed(config, before), -slowly), -slowly)
 
 
+@pytest.mark.parametrize("action", [(0.1, 0.1), (0.0, 0.0), (-0.3, 0.3)])
+def test_a_robot_that_has_crept_too_near_is_ordered_away(action: tuple[float, float]) -> None:
+    config = TaskConfig(**task())
+    keep, before = config.make_filter(), np.full(36, 5.0)
+    for gap, leaves in ((0.002, True), (0.012, False)):
+        before[17:19] = config.robot.radius + gap
+        ordered = keep(observed(config, before), np.array(action, np.float32))
+        assert (ordered.sum() < -0.01) == leaves
+
+
 def test_what_is_nearer_than_the_observation_tells_may_be_at_the_rim() -> None:
     config = TaskConfig(**task(closeness_distance=0.4))
     assert config.make_filter()(observed(config, 0.3), np.full(2, 0.1, np.float32)).sum() <= 0.0
