@@ -76,6 +76,7 @@ def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "progress_scale": settings.progress_scale,
         "detour_chance": settings.detour_chance,
         "noise": asdict(settings.noise),
+        "latency": settings.latency,
         **env_arguments(settings),
         **({"reward": _costly_reward(settings)} if settings.step_cost else {}),
     }

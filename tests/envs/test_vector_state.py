@@ -29,7 +29,7 @@ from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
 from tests.envs.busy import BUSY, POLITE, STANDING, needs
 from tests.envs.shapes import SCATTERED, random_shapes
 
-ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
+ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, drift=0.05)
 GIVEN = {"worlds": [BUSY, None, "B"], "tasks": [Task((0.0, -1.0, 1.0), (0.0, 3.0)), None, None]}
 CASES: dict[str, dict[str, Any]] = {
     "worlds": {"world": ["B", "D", "test"], "action_repeat": 3},

@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_positive, check_share
+from mpfa_envs.checks import check_not_negative, check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
 from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.robots.standing import STANDING_TIME, stands_still
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
-from mpfa_envs.sensing.observation_loops import observe_all
+from mpfa_envs.sensing.observation_loops import look_from, observe_all
 
 if TYPE_CHECKING:
     import os
@@ -36,6 +38,18 @@ _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
+_REDUCED: Final = 3
+"""Rays of a sector of a scan that is seen from another pose."""
+_OFF: Final = 0.05
+"""Error of the latency that the filter allows for [s]."""
+_STRENGTH: Final = 0.8
+"""Share of their acceleration that the wheels have at least, where the robot's orders are late."""
+_BACK: Final = 0.5
+"""Distance by which a robot that stands still drives back [m]."""
+_BACK_TIME: Final = 5.0
+"""Longest time for which it does so [s]."""
+_BACK_SPEED: Final = 0.3
+"""Share of its greatest speed with which it does so."""
 _BEYOND: Final = 0.02
 """Share of its speed range by which a wheel's command may exceed it."""
 
@@ -78,6 +92,10 @@ class Pilot:
             position; the path leads through it alone.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
+        latency: Time from a scan to the moment at which the wheels take the order that follows from
+            it [s]; None: that of the robot. The pilot drives the orders under way first, and
+            decides for the state that it comes to; its filter allows for an error of 0.05 s, and
+            for wheels that are slower by a fifth.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -97,6 +115,7 @@ class Pilot:
         silent: Silent = "reject",
         map_size: float = 40.0,
         clearance: float | None = None,
+        latency: float | None = None,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -122,6 +141,8 @@ class Pilot:
                 f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
                 "policy with it, or give a lower min_wheel_speed if its wheels can do that"
             )
+        self.latency = self.robot.latency if latency is None else latency
+        check_not_negative("latency", self.latency)
         mount = self.robot.lidar_mount if mount is None else mount
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
@@ -142,6 +163,10 @@ class Pilot:
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
+        self._places: list[tuple[float, float]] = []
+        self._back: tuple[float, float] | None = None
+        self._back_since, self._stood = -math.inf, (0.0, 0.0)
+        self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
     @classmethod
@@ -169,6 +194,11 @@ class Pilot:
         return self.card.period / self.pace
 
     @property
+    def has_filter(self) -> bool:
+        """True if a filter keeps the robot off what it sees."""
+        return self._keep is not None
+
+    @property
     def goal(self) -> tuple[float, float] | None:
         """The goal (x, y) [m]; None without."""
         return self._goal
@@ -190,6 +220,7 @@ class Pilot:
         goal = _pair("goal", goal)
         self._check_on_map(goal, center)
         self._goal, self._center, self._fresh = goal, center, True
+        self._places, self._back, self._back_since = [], None, -math.inf
 
     def stop(self) -> None:
         """Give up the goal."""
@@ -224,15 +255,20 @@ class Pilot:
         speeds: tuple[float, float],
         *,
         scan_pose: tuple[float, float, float] | None = None,
+        time: float | None = None,
+        age: float = 0.0,
     ) -> NDArray[np.float32]:
         """Build the policy's observation, once for each decision.
+
+        The robot is taken to stop then, unless :meth:`give` names its order.
 
         Args:
             scan: What the lidar has measured.
             pose: Of the robot (x, y, heading) in the frame of the odometry [m, m, rad].
             speeds: Forward and turning speed [m/s, rad/s].
-            scan_pose: Pose at the time of the scan, from which it is entered in the map; None: it
-                is of now.
+            scan_pose: Pose at the time of the scan; None: it is of now.
+            time: Time of the decision [s]; None: a period after the last one.
+            age: Age of pose and speeds then [s].
 
         Returns:
             The observation, ``[O]``.
@@ -241,13 +277,31 @@ class Pilot:
             ScanError: If the scan lacks the range of a sector.
             ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
+        return self._observe(scan, pose, speeds, scan_pose, time, age)[0]
+
+    def _observe(
+        self,
+        scan: Scan,
+        pose: tuple[float, float, float],
+        speeds: tuple[float, float],
+        scan_pose: tuple[float, float, float] | None,
+        time: float | None,
+        age: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+        """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
         if self._goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
         _pair("pose", (x, y))
-        linear, angular = check_finite("speeds", speeds, 2)
+        motion = np.array((x, y, heading, *check_finite("speeds", speeds, 2)))
+        taken = motion[:3]
+        if scan_pose is not None:
+            taken = np.array(check_finite("scan_pose", scan_pose, 3))
+        self._time = self._time + self.period if time is None else time
+        ahead = self._ahead(motion, age)
+        # Unless there is another order, as after an error: who gets none stops.
+        self.give(self._time, 0.0, 0.0)
         card = self.card
-        taken = (x, y, heading) if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
         center = self._center or (x, y)
         self._check_on_map(self._goal, center)
         ranges, points = self.sectors.read(scan)
@@ -256,26 +310,60 @@ class Pilot:
             if self._fresh:
                 self._map.begin(center)
                 self._center = center
-            if taken != (x, y, heading):
-                points = points.seen_from((x, y, heading), taken, card.max_range)
-            path = self._map.sense((x, y, heading), self._goal, points)
+            path = self._map.sense(ahead[0], taken, self._goal, points)
         robot = card.robot
-        observe_all(
-            np.array([[x, y, heading, linear / self.pace, angular / self.pace]]),
-            np.array([self._goal]),
-            np.array([math.dist((x, y), self._goal)]),
-            np.array([self._fresh]),
-            np.ones(1, dtype=np.bool_),
-            ranges[None],
-            False,
-            (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
-            path,
-            card.sectors,
-            card.history,
-            self._observation,
-        )
+        rows = []
+        for state in ahead:
+            seen = ranges
+            if (state[:3] != taken).any():
+                seen = np.empty(card.sectors * (1 if card.reduction == "single" else _REDUCED))
+                view = math.radians(card.field_of_view)
+                look_from(state[:3], *points, taken, card.max_range, view, seen)
+            observation = self._observation.copy()
+            observe_all(
+                np.array([[*state[:3], *(state[3:] / self.pace)]]),
+                np.array([self._goal]),
+                np.array([math.dist(state[:2], self._goal)]),
+                np.array([self._fresh]),
+                np.ones(1, dtype=np.bool_),
+                seen[None],
+                card.reduction == "median",
+                (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
+                path,
+                card.sectors,
+                card.history,
+                observation,
+            )
+            rows.append(observation[0])
+        self._observation[0] = rows[0]
         self._fresh = False
-        return self._observation[0].copy()
+        return rows[0], np.array(rows), float(ahead[0, 2] - taken[2])
+
+    def _ahead(self, motion: NDArray[np.float64], age: float) -> NDArray[np.float64]:
+        """Motions that the robot may have when its next order acts, ``[S, 5]``."""
+        late, soon = self.latency + _OFF, max(self.latency - _OFF, 0.0)
+        assumed = [(self.latency, 1.0)]
+        if self._keep is not None:
+            assumed += [(late, _STRENGTH), (soon, 1.0)]
+        since = self._time - age
+        return np.array(
+            [
+                self._orders.ahead(
+                    motion, since=since, until=self._time + latency, latency=latency, strength=share
+                )
+                for latency, share in assumed
+            ]
+        )
+
+    def give(self, time: float, linear: float, angular: float) -> None:
+        """Remember what was ordered, where that is not what the pilot has decided.
+
+        Args:
+            time: When it was ordered, by the clock of the decisions [s].
+            linear: Forward speed [m/s].
+            angular: Turning speed [rad/s].
+        """
+        self._orders.give(time, linear, angular)
 
     def decide(
         self,
@@ -284,32 +372,67 @@ class Pilot:
         speeds: tuple[float, float],
         *,
         scan_pose: tuple[float, float, float] | None = None,
+        time: float | None = None,
+        age: float = 0.0,
     ) -> Command:
         """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
 
         Returns:
             The speeds.
         """
-        observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
-        blind, hidden = self.sectors.blind(scan)
+        observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
+        blind, hidden = self.sectors.blind(scan, turn)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         learned = self.card.robot
         left, right = learned.wheel_speeds(action)
+        self._places.append((pose[0], pose[1]))
+        if learned.min_wheel_speed < 0.0:
+            behind = (np.abs(blind) > math.pi - _TOWARDS).any()
+            left, right = self._drive_back(pose, reverses=not behind) or (left, right)
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         if (np.abs(towards) < _TOWARDS).any():
             left, right = 0.5 * (left - right), 0.5 * (right - left)
         if self._keep is not None:
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
-            observation[: self.card.sectors][hidden] = 1.0
+            states[:, : self.card.sectors][:, hidden] = 1.0
             slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
             action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
-            left, right = learned.wheel_speeds(self._keep(observation, action))
+            left, right = learned.wheel_speeds(self._keep.among(states, action))
         linear = self.pace * 0.5 * (left + right)
         angular = self.pace * (right - left) / learned.wheel_base
         turn = 0.5 * angular * self.robot.wheel_base
+        self.give(self._time, linear, angular)
         return Command(linear - turn, linear + turn, linear, angular)
+
+    @property
+    def stands_still(self) -> bool:
+        """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
+        return stands_still(self._places, self.period)
+
+    def _drive_back(
+        self, pose: tuple[float, float, float], *, reverses: bool
+    ) -> tuple[float, float] | None:
+        """Speeds of the wheels of a robot that stands still [m/s], to where it came from."""
+        x, y, heading = pose
+        waits = self._time - self._back_since >= STANDING_TIME
+        if self._back is None and waits and self.stands_still:
+            # What it has driven it has seen.
+            away = (place for place in reversed(self._places) if math.dist(place, (x, y)) >= _BACK)
+            self._back, self._back_since = next(away, None), self._time
+            self._stood = x, y
+        driven = math.dist(self._stood, (x, y)) >= 0.8 * _BACK
+        if self._back is None or driven or self._time - self._back_since >= _BACK_TIME:
+            self._back = None
+            return None
+        bearing = math.atan2(self._back[1] - y, self._back[0] - x) - heading
+        ahead = math.cos(bearing) if reverses else 1.0
+        off = math.remainder(bearing, math.pi if reverses else math.tau)
+        learned = self.card.robot
+        speed = _BACK_SPEED * learned.max_wheel_speed * max(math.cos(off), 0.0) ** 4
+        speed, turn = math.copysign(speed, ahead), 0.5 * math.sin(off) * learned.wheel_base
+        return speed - turn, speed + turn
 
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
@@ -360,6 +483,7 @@ class Pilot:
             time_step=card.period / repeat,
             action_repeat=repeat,
             clearance=clearance,
+            braking=_STRENGTH,
         )
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean
+from mpfa_envs.checks import (
+    check_count,
+    check_not_negative,
+    check_number,
+    check_positive,
+    did_you_mean,
+)
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -54,6 +60,8 @@ class RobotModel:
         lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
             [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. A pilot reads
             scans by it; in training rays begin at the robot's center.
+        latency: Time from a scan to the moment at which the wheels take the order that follows from
+            it [s].
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
@@ -83,6 +91,7 @@ class RobotModel:
     lidar_rays: int | None = None
     lidar_range: float = 10.0
     lidar_mount: tuple[float, ...] = (0.0, 0.0, 0.0)
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -98,7 +107,8 @@ class RobotModel:
                 continue
             if not isinstance(value, (int, float)):
                 raise ValueError(f"{field.name} must be a finite number, got {value!r}")
-            (check_number if field.name == "min_wheel_speed" else check_positive)(field.name, value)
+            check = {"min_wheel_speed": check_number, "latency": check_not_negative}
+            check.get(field.name, check_positive)(field.name, value)
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"

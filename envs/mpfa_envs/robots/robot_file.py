@@ -19,6 +19,7 @@ _UNITS: Final = {
     "max_wheel_speed": "m/s",
     "wheel_acceleration": "m/s²",
     "turn_limit": "rad/s",
+    "latency": "s",
     "field_of_view": "deg",
 }
 """Units of the numbers that are not in meters."""

@@ -19,8 +19,6 @@ class NoiseSettings:
     """Chance that a ray reports the greatest range."""
     slip: float = 0.0
     """Mean share of its path that a wheel loses, up to 0.45."""
-    latency: int = 0
-    """Time steps of 0.1 s after which an action reaches the wheels."""
     drift: float = 0.0
     """Standard deviation of the share of the error of odometry in distances, and in turns."""
 
@@ -66,6 +64,9 @@ class EnvironmentSettings:
     """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
+    latency: Any = None
+    """Time from a scan to the moment at which the wheels take the order [s], or the least and the
+    greatest, ``[0.0,0.2]``, between which each episode has its own; null: the robot's."""
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off obstacles
     (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1
