@@ -72,11 +72,11 @@ from training.worlds import parse_worlds, world_name
 
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
-    *("success", "collision", "timeout", "spl", "sct", "time_s"),
+    *("success", "collision", "timeout", "standstill", "spl", "sct", "time_s"),
     *("path_length", "plan_s", "decision_s"),
 )
 _COLUMNS = {
-    **dict.fromkeys(("success", "collision", "timeout"), "{:.1%}"),
+    **dict.fromkeys(("success", "collision", "timeout", "standstill"), "{:.1%}"),
     **dict.fromkeys(("spl", "sct"), "{:.3f}"),
 }
 _BARN = {"barn_score": "{:.3f}"}
