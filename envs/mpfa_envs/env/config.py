@@ -40,6 +40,7 @@ Progress = Literal["straight_line", "shortest_path", "none"]
 
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
+        "max_steps": 500,
         "action_repeat": 1,
         "progress_scale": 15.0,
         "clearance": PAPER_CLEARANCE,
@@ -50,6 +51,8 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
 
 The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
 """
+FARTHEST: Final = 105.0
+"""Distance that a robot drives at full speed within its time limit, unless another is given [m]."""
 _MOST_STEPS: Final = 1_000_000
 """Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
@@ -123,8 +126,9 @@ class TaskConfig:
     """``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on exact arcs,
     several times faster, and needs no PyBullet. Lidar, clearance and collisions are computed from
     the same shapes in both."""
-    max_steps: int = 500
-    """Time limit of an episode in time steps."""
+    max_steps: int = None  # type: ignore[assignment]
+    """Time limit of an episode in time steps. None: the time in which the robot drives
+    :data:`FARTHEST` at full speed, 150 s for a Kobuki."""
     time_step: float = 0.1
     """Duration of a time step [s], in which the robot must not drive farther than its
     :attr:`collision_distance`."""
@@ -185,6 +189,10 @@ class TaskConfig:
             self._set("closeness_distance", round(robot.radius + clearance, 9))
         self._set("noise", resolve_noise(self.noise))
         self._set("latency", _read_latency(robot.latency if self.latency is None else self.latency))
+        check_positive("time_step", self.time_step)
+        if self.max_steps is None:
+            limit = FARTHEST / (robot.max_wheel_speed * self.time_step)
+            self._set("max_steps", min(round(limit), _MOST_STEPS))
         for name, check in _CHECKS.items():
             self._set(name, check(name, getattr(self, name)))
         if not self.min_goal_distance > self.goal_radius:

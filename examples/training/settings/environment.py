@@ -33,8 +33,9 @@ class EnvironmentSettings:
     your own (``docs/howto/robot.md``), whose values a run keeps in its place."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
-    max_steps: int = 500
-    """Time limit of an episode [0.1 s]."""
+    max_steps: int | None = None
+    """Time limit of an episode [0.1 s]; null: the time in which the robot drives 105 m at full
+    speed, as in evaluations."""
     action_repeat: int | None = 2
     """Time steps of 0.1 s for which an action is held. DDPG is less reliable with one
     (``docs/tuning.md``). Null: the time in which the robot drives 0.14 m at full speed, at least

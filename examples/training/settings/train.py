@@ -285,7 +285,11 @@ SAME = "same"
 HARDEST = {"mixed": "mazes"}
 """Worlds in which policies that do well in a mixture of worlds still differ."""
 REGIMES: dict[str, dict[str, Any]] = {
-    "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
+    "paper": {
+        "regime": "paper",
+        "defaults": [{"override /curriculum": "paper"}],
+        "environment": {"max_steps": 500},
+    },
     "rooms": {
         "regime": "rooms",
         "defaults": [{"override /curriculum": "rooms"}],

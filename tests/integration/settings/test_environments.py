@@ -113,7 +113,7 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     seen = training.reset()["observation"].numpy()[0]
     task = training.env.tasks[0]
     assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
-    for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):
+    for name in ("action_repeat", "closeness_distance", "physics"):
         assert getattr(judging.config, name) == getattr(training.env.config, name)
     assert judging.config.closeness_distance == pytest.approx(0.28)
     training.close()
