@@ -11,11 +11,11 @@ import numpy as np
 from mpfa_envs.checks import check_not_negative, check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
+from mpfa_envs.deploy.pace import fastest_pace, tolerance, wheel_range, widening
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
-from mpfa_envs.robots.model import RobotModel
-from mpfa_envs.robots.orders import Orders
+from mpfa_envs.deploy.way_back import WayBack
+from mpfa_envs.robots.orders import STRENGTH, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.robots.standing import STANDING_TIME, stands_still
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
 from mpfa_envs.sensing.observation_loops import look_from, observe_all
@@ -40,18 +40,6 @@ _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _REDUCED: Final = 3
 """Rays of a sector of a scan that is seen from another pose."""
-_OFF: Final = 0.05
-"""Error of the latency that the filter allows for [s]."""
-_STRENGTH: Final = 0.8
-"""Share of their acceleration that the wheels have at least, where the robot's orders are late."""
-_BACK: Final = 0.5
-"""Distance by which a robot that stands still drives back [m]."""
-_BACK_TIME: Final = 5.0
-"""Longest time for which it does so [s]."""
-_BACK_SPEED: Final = 0.3
-"""Share of its greatest speed with which it does so."""
-_BEYOND: Final = 0.02
-"""Share of its speed range by which a wheel's command may exceed it."""
 
 
 class Command(NamedTuple):
@@ -125,7 +113,7 @@ class Pilot:
                 f"the policy learned with a robot of radius {learned.radius} m, "
                 f"{self.robot.name} has {self.robot.radius} m"
             )
-        most = _fastest_pace(self.robot, learned)
+        most = fastest_pace(self.robot, learned)
         self.pace = most if pace is None else check_share("pace", pace)
         if not 0.0 < self.pace <= most:
             raise ValueError(
@@ -134,8 +122,8 @@ class Pilot:
                 f"rad/s and changes its wheels' speed by {self.robot.wheel_limits.acceleration} "
                 f"m/s², got {pace}"
             )
-        least = self.pace * _wheel_range(self.robot, learned)[0]
-        if least < self.robot.min_wheel_speed - _tolerance(self.robot):
+        least = self.pace * wheel_range(self.robot, learned)[0]
+        if least < self.robot.min_wheel_speed - tolerance(self.robot):
             raise CardError(
                 f"on the sharpest arcs of the policy a wheel of {self.robot.name} would turn at "
                 f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
@@ -163,9 +151,7 @@ class Pilot:
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
-        self._places: list[tuple[float, float]] = []
-        self._back: tuple[float, float] | None = None
-        self._back_since, self._stood = -math.inf, (0.0, 0.0)
+        self._way_back = WayBack(learned, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
@@ -220,7 +206,7 @@ class Pilot:
         goal = _pair("goal", goal)
         self._check_on_map(goal, center)
         self._goal, self._center, self._fresh = goal, center, True
-        self._places, self._back, self._back_since = [], None, -math.inf
+        self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
         """Give up the goal."""
@@ -294,11 +280,11 @@ class Pilot:
         x, y, heading = check_finite("pose", pose, 3)
         _pair("pose", (x, y))
         motion = np.array((x, y, heading, *check_finite("speeds", speeds, 2)))
-        taken = motion[:3]
-        if scan_pose is not None:
-            taken = np.array(check_finite("scan_pose", scan_pose, 3))
+        taken = np.array(check_finite("scan_pose", scan_pose or (x, y, heading), 3))
         self._time = self._time + self.period if time is None else time
-        ahead = self._ahead(motion, age)
+        ahead = self._orders.states(
+            motion, age, self._time, self.latency, certain=not self.has_filter
+        )
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
         card = self.card
@@ -339,22 +325,6 @@ class Pilot:
         self._fresh = False
         return rows[0], np.array(rows), float(ahead[0, 2] - taken[2])
 
-    def _ahead(self, motion: NDArray[np.float64], age: float) -> NDArray[np.float64]:
-        """Motions that the robot may have when its next order acts, ``[S, 5]``."""
-        late, soon = self.latency + _OFF, max(self.latency - _OFF, 0.0)
-        assumed = [(self.latency, 1.0)]
-        if self._keep is not None:
-            assumed += [(late, _STRENGTH), (soon, 1.0)]
-        since = self._time - age
-        return np.array(
-            [
-                self._orders.ahead(
-                    motion, since=since, until=self._time + latency, latency=latency, strength=share
-                )
-                for latency, share in assumed
-            ]
-        )
-
     def give(self, time: float, linear: float, angular: float) -> None:
         """Remember what was ordered, where that is not what the pilot has decided.
 
@@ -386,11 +356,9 @@ class Pilot:
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         learned = self.card.robot
-        left, right = learned.wheel_speeds(action)
-        self._places.append((pose[0], pose[1]))
-        if learned.min_wheel_speed < 0.0:
-            behind = (np.abs(blind) > math.pi - _TOWARDS).any()
-            left, right = self._drive_back(pose, reverses=not behind) or (left, right)
+        reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
+        back = self._way_back.speeds(pose, self._time, reverses=reverses)
+        left, right = back or learned.wheel_speeds(action)
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         if (np.abs(towards) < _TOWARDS).any():
             left, right = 0.5 * (left - right), 0.5 * (right - left)
@@ -409,30 +377,7 @@ class Pilot:
     @property
     def stands_still(self) -> bool:
         """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
-        return stands_still(self._places, self.period)
-
-    def _drive_back(
-        self, pose: tuple[float, float, float], *, reverses: bool
-    ) -> tuple[float, float] | None:
-        """Speeds of the wheels of a robot that stands still [m/s], to where it came from."""
-        x, y, heading = pose
-        waits = self._time - self._back_since >= STANDING_TIME
-        if self._back is None and waits and self.stands_still:
-            # What it has driven it has seen.
-            away = (place for place in reversed(self._places) if math.dist(place, (x, y)) >= _BACK)
-            self._back, self._back_since = next(away, None), self._time
-            self._stood = x, y
-        driven = math.dist(self._stood, (x, y)) >= 0.8 * _BACK
-        if self._back is None or driven or self._time - self._back_since >= _BACK_TIME:
-            self._back = None
-            return None
-        bearing = math.atan2(self._back[1] - y, self._back[0] - x) - heading
-        ahead = math.cos(bearing) if reverses else 1.0
-        off = math.remainder(bearing, math.pi if reverses else math.tau)
-        learned = self.card.robot
-        speed = _BACK_SPEED * learned.max_wheel_speed * max(math.cos(off), 0.0) ** 4
-        speed, turn = math.copysign(speed, ahead), 0.5 * math.sin(off) * learned.wheel_base
-        return speed - turn, speed + turn
+        return self._way_back.stands_still
 
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
@@ -463,7 +408,7 @@ class Pilot:
     def _filter(self, clearance: float) -> SafetyFilter:
         """The filter of the task that a policy learned, for the robot that drives."""
         card, learned = self.card, self.card.robot
-        braking = self.robot.wheel_limits.acceleration / _widening(self.robot, learned)
+        braking = self.robot.wheel_limits.acceleration / widening(self.robot, learned)
         braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
         body = replace(
             learned,
@@ -483,7 +428,7 @@ class Pilot:
             time_step=card.period / repeat,
             action_repeat=repeat,
             clearance=clearance,
-            braking=_STRENGTH,
+            braking=STRENGTH,
         )
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
@@ -495,36 +440,6 @@ class Pilot:
                 f"goal must be on the map, {self._map_size:g} m (map_size) around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
-
-
-def _widening(robot: RobotModel, learned: RobotModel) -> float:
-    """Ratio of wheel speed differences to another robot's on the same arc, at least 1."""
-    return max(1.0, robot.wheel_base / learned.wheel_base)
-
-
-def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
-    """Least and greatest speed of its wheels on the arcs of another robot, at its pace [m/s]."""
-    middle = 0.5 * (learned.max_wheel_speed + learned.min_wheel_speed)
-    span = 0.5 * (learned.max_wheel_speed - learned.min_wheel_speed)
-    span *= _widening(robot, learned)
-    return middle - span, middle + span
-
-
-def _tolerance(robot: RobotModel) -> float:
-    """Excess of commanded wheel speeds over their range [m/s]."""
-    return _BEYOND * (robot.max_wheel_speed - robot.min_wheel_speed)
-
-
-def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
-    """The greatest share of the other robot's speed with which it can drive the same arcs."""
-    wheels = (robot.max_wheel_speed + _tolerance(robot)) / _wheel_range(robot, learned)[1]
-    pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
-    if robot.turn_limit is not None:
-        pace = min(pace, robot.turn_limit / learned.max_angular_speed)
-    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
-        needed = learned.wheel_acceleration * _widening(robot, learned)
-        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
-    return pace
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
     from mpfa_envs.robots.model import RobotModel
 
+STRENGTH: Final = 0.8
+"""Share of their acceleration that a real robot's wheels have at least."""
+_OFF: Final = 0.05
+"""Error that the latency of a real robot may have [s]."""
 _TIME_STEP: Final = 0.02
 """Time for which a real wheel's speed is taken as constant [s]."""
 _KEPT: Final = 5.0
@@ -36,6 +40,25 @@ class Orders:
         given.append((time, linear - across, linear + across))
         while len(given) > 1 and given[1][0] < time - _KEPT:
             given.popleft()
+
+    def states(
+        self,
+        motion: NDArray[np.float64],  # (x, y, heading, forward, turning), [5]
+        age: float,  # of the motion [s]
+        now: float,  # [s]
+        latency: float,  # [s]
+        *,
+        certain: bool,
+    ) -> NDArray[np.float64]:
+        """Motions that the robot may have when an order of now acts, ``[S, 5]``."""
+        assumed = [(latency, 1.0)]
+        if not certain:
+            assumed += [(latency + _OFF, STRENGTH), (max(latency - _OFF, 0.0), 1.0)]
+        rows = [
+            self.ahead(motion, since=now - age, until=now + late, latency=late, strength=strength)
+            for late, strength in assumed
+        ]
+        return np.array(rows)
 
     def ahead(
         self,
