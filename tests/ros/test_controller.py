@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
 
+from mpfa_envs import ROBOTS
 from mpfa_envs.deploy import Pilot, Scan
 from mpfa_envs.ros import messages
 from mpfa_envs.ros.controller import Controller, Order
@@ -166,6 +167,23 @@ def test_an_obstacle_inside_the_stop_distance_stops_it(
     assert order[:2] == (({"burger": 0.22}.get(robot, 0.5) if reason == "driving" else 0.0), 0.0)
     controller.see(scan(), 10.1)
     assert reasons(controller, [10.1]) == ["driving"]
+
+
+@pytest.mark.parametrize(("clearance", "stops"), [(None, True), (0.03, False)])
+def test_what_a_filter_allows_is_driven_and_without_one_an_obstacle_leaves_the_turn(
+    clearance: float | None, stops: bool
+) -> None:
+    facts = card(robot=ROBOTS["kobuki"], sectors=36, field_of_view=360.0, observation_size=42)
+    arc = np.array([[0.0, 0.5]], np.float32)
+    controller = Controller(Pilot(facts, lambda _: arc, clearance=clearance), stop_distance=0.05)
+    controller.aim((4.0, 0.0))
+    beside = np.full(360, 3.0)
+    beside[90:92] = 0.18 + 0.04  # To the right.
+    controller.see(Scan(-math.pi, math.pi / 180, np.roll(beside, 5), 0.1, 8.0), 10.0)
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    orders = [controller.tick(10.0 + 0.05 * step) for step in range(3)]
+    assert all(order is not None and order.angular > 0.0 for order in orders[1:])
+    assert all(order is not None and (order.linear == 0.0) == stops for order in orders[1:])
 
 
 @pytest.mark.parametrize(
