@@ -70,11 +70,11 @@ if TYPE_CHECKING:
 
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
-    *("success", "collision", "timeout", "spl", "sct", "time_s"),
+    *("success", "collision", "timeout", "standstill", "spl", "sct", "time_s"),
     *("path_length", "plan_s", "decision_s"),
 )
 _COLUMNS = {
-    **dict.fromkeys(("success", "collision", "timeout"), "{:.1%}"),
+    **dict.fromkeys(("success", "collision", "timeout", "standstill"), "{:.1%}"),
     **dict.fromkeys(("spl", "sct"), "{:.3f}"),
 }
 _BARN = {"barn_score": "{:.3f}"}
@@ -131,7 +131,14 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--noise",
         type=read_noise,
         metavar="NAME=VALUE,...",
-        help="errors of the robot: range_noise, dropout, slip, latency, drift (default: none)",
+        help="errors of the robot: range_noise, dropout, slip, drift (default: none)",
+    )
+    parser.add_argument(
+        "--latency",
+        type=float,
+        metavar="SECONDS",
+        help="time from a scan to the moment at which the wheels take the order (default: the "
+        "robot's)",
     )
     parser.add_argument(
         "--filter",
@@ -168,14 +175,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def read_noise(words: str) -> RobotNoise:
-    """Parse ``--noise slip=0.1,latency=1``."""
+    """Parse ``--noise slip=0.1,drift=0.02``."""
     try:
         values = {
             name: float(value) for name, _, value in (w.partition("=") for w in words.split(","))
         }
-        if "latency" in values and values["latency"].is_integer():
-            values["latency"] = int(values["latency"])
-        return RobotNoise(**values)  # type: ignore[arg-type]
+        return RobotNoise(**values)
     except (TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 
@@ -203,6 +208,7 @@ def output_folder(options: argparse.Namespace) -> Path:
         options.physics,
         seed=options.seed,
         noise=options.noise,
+        latency=options.latency,
         filtered=options.filter,
         robot=options.robot if options.policy is None else None,
     )
@@ -311,6 +317,25 @@ def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> It
             yield f"in wandb, too: {found}"
 
 
+def described(options: argparse.Namespace, asked: dict[str, Any]) -> dict[str, Any]:
+    """What an evaluation was of, for the file of its settings."""
+    policy = options.loaded
+    document: dict[str, Any] = {"words": options.worlds, **asked}
+    if options.filter:
+        document["filter"] = {"clearance": CLEARANCE}
+    if options.noise is not None:
+        document["noise"] = asdict(options.noise)
+    if options.latency is not None:
+        document["latency"] = options.latency
+    if isinstance(policy, Policy):
+        document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
+    else:
+        document |= {"policy": options.policy, "memory": options.memory}
+    if options.robot is not None:
+        document["robot"] = asdict(options.robot)
+    return document
+
+
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     """Evaluate, print, write.
 
@@ -338,13 +363,12 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     folder = options.output or output_folder(options)
     physics = options.physics
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
-    how = {"noise": options.noise, "physics": physics}
+    errors = {"noise": options.noise, "latency": options.latency}
+    how = {**errors, "physics": physics}
     if options.live:
         return show_live(driver, options, how)
     with held(folder):
-        driven = drive(
-            driver, options.names, noise=options.noise, progress=not options.no_pictures, **asked
-        )
+        driven = drive(driver, options.names, **errors, progress=not options.no_pictures, **asked)
         results = [result for drives in driven for result in drives.results]
         rows = [
             {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
@@ -362,17 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        document: dict[str, Any] = {"words": options.worlds, **asked}
-        if options.filter:
-            document["filter"] = {"clearance": CLEARANCE}
-        if options.noise is not None:
-            document["noise"] = asdict(options.noise)
-        if isinstance(policy, Policy):
-            document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
-        else:
-            document |= {"policy": options.policy, "memory": options.memory}
-        if options.robot is not None:
-            document["robot"] = asdict(options.robot)
+        document = described(options, asked)
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")

@@ -43,6 +43,7 @@ MEANT: Final[Mapping[str, tuple[float, float, str]]] = {
     **dict.fromkeys(("unseen", "min_goal_distance", "max_goal_distance"), (0.01, 1000.0, "m")),
     "map_size": (1.0, 1000.0, "m"),
     **dict.fromkeys(("time_step", "check_period"), (1e-4, 10.0, "s")),
+    "latency": (0.0, 5.0, "s"),
     **dict.fromkeys(("scan_timeout", "odometry_timeout", "command_timeout"), (1e-3, 60.0, "s")),
 }
 """Least and greatest size that a number can be meant to have, wherever it is given, and its unit;

@@ -40,7 +40,6 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     return {
         "robot": robot,
         "physics": settings.physics,
-        "max_steps": settings.max_steps,
         "action_repeat": _repeat(robot)
         if settings.action_repeat is None
         else settings.action_repeat,
@@ -61,11 +60,13 @@ def _repeat(robot: RobotModel) -> int:
 def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     """Return the task to learn: what a policy needs, rewards, and ends of an episode."""
     return {
+        "max_steps": settings.max_steps,
         "clearance": settings.clearance,
         "progress": settings.progress,
         "progress_scale": settings.progress_scale,
         "detour_chance": settings.detour_chance,
         "noise": asdict(settings.noise),
+        "latency": settings.latency,
         **env_arguments(settings),
         **({"reward": _costly_reward(settings)} if settings.step_cost else {}),
     }

@@ -62,6 +62,7 @@ def evaluation_folder(
     *,
     seed: int = 0,
     noise: RobotNoise | None = None,
+    latency: float | None = None,
     filtered: bool = False,
     robot: RobotModel | None = None,
 ) -> str:
@@ -71,7 +72,7 @@ def evaluation_folder(
         >>> evaluation_folder(["test", "bars:test"], "wheels", noise=RobotNoise(slip=0.1))
         'evaluation-test+bars-test-wheels-slip0.1'
     """
-    errors = {} if noise is None else asdict(noise)
+    errors = {**({} if noise is None else asdict(noise)), "latency": latency}
     name = "".join(
         [
             f"evaluation-{worlds_label(words)}-{physics}",
@@ -148,6 +149,7 @@ def drive(
     seed: int,
     physics: str | None,
     noise: RobotNoise | None = None,
+    latency: float | None = None,
     progress: bool,
 ) -> list[Drives]:
     """Drive a policy through fixed tasks of each world, as :func:`mpfa_envs.evaluate`.
@@ -155,7 +157,7 @@ def drive(
     Contact is the only collision. Return tasks, results and paths of each world; these do not
     depend on the other worlds.
     """
-    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise, "latency": latency}
     if physics is not None:
         arguments["physics"] = physics
     sets = [tasks_of(policy, [each], episodes=episodes, seed=seed) for each in worlds]

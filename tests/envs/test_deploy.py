@@ -68,6 +68,49 @@ def test_it_senses_what_the_environment_senses(tmp_path: Path, arguments: dict[s
     env.close()
 
 
+@pytest.mark.parametrize("latency", [0.1, 0.26])
+@pytest.mark.parametrize("memory", ["none", "map"])
+def test_with_late_orders_it_senses_what_the_environment_senses(
+    tmp_path: Path, latency: float, memory: str
+) -> None:
+    arguments: dict[str, Any] = {"robot": "kobuki", "memory": memory, "latency": latency}
+    arguments |= {"closeness_distance": 0.23, "physics": "kinematic", "time_step": 0.02}
+    arguments |= {"action_repeat": 10}
+    pilot = Pilot.load(exported(tmp_path, size_of(arguments), **arguments), latency=latency)
+    env = NavigationEnv(world="C", **arguments)
+    rng, robot = np.random.default_rng(0), env.config.robot
+    seen, _ = env.reset(seed=2)
+    assert env.task is not None
+    pilot.begin(env.task.goal, map_center=(0.0, 0.0))
+    for step in range(25):
+        mine = pilot.observe(*sense(env), time=0.2 * step)
+        np.testing.assert_allclose(mine, seen, rtol=0, atol=1e-5)
+        action = rng.uniform(-0.2, 0.8, 2).astype(np.float32)
+        left, right = robot.wheel_speeds(action)
+        pilot.give(0.2 * step, 0.5 * (left + right), (right - left) / robot.wheel_base)
+        seen, _, ended, _, _ = env.step(action)
+        if ended:
+            break
+    assert step > 10
+    env.close()
+
+
+def test_a_robot_that_stands_still_drives_back_to_where_it_came_from() -> None:
+    facts = card(robot=KOBUKI, sectors=36, field_of_view=360.0, observation_size=42)
+    pilot = Pilot(facts, lambda _: np.zeros((1, 2), np.float32), clearance=0.03)
+    pilot.begin((4.0, 0.0))
+    free, ordered = Scan(-math.pi, math.pi / 180, np.full(360, 2.0)), []
+    for step in range(80):
+        x = min(0.1 * step, 1.0)
+        ordered.append(pilot.decide(free, (x, 0.0, 0.0), (0.0, 0.0)).linear)
+    # It has stood for ten seconds from the second decision on that is within 0.1 m of the last.
+    backs = [step for step, speed in enumerate(ordered) if speed < -0.1]
+    assert backs[0] == 9 + 50 and backs == list(range(59, 80))
+    assert pilot.stands_still and max(map(abs, ordered[:59])) == 0.0
+    # Once it is half a meter away the policy decides.
+    assert pilot.decide(free, (0.55, 0.0, 0.0), (0.0, 0.0)).linear == 0.0
+
+
 def test_a_command_is_the_action_as_wheel_speeds_and_twist(tmp_path: Path) -> None:
     file = exported(tmp_path)
     pilot, policy = Pilot.load(file), mpfa_envs.load_policy(file)

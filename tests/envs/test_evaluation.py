@@ -42,6 +42,10 @@ def circle(observation: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.broadcast_to(np.array([-1.0, 1.0]), (*observation.shape[:-1], 2))
 
 
+def stand(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.zeros(2)
+
+
 def evaluated(policy: Any = steer, **arguments: Any) -> object:
     return evaluate(policy, **{"world": "A", "physics": "kinematic", **arguments})
 
@@ -226,16 +230,32 @@ def test_the_test_worlds_of_a_generator_have_four_tasks_each() -> None:
     ]  # fmt: skip
 
 
-def test_generators_have_150_seconds_and_barn_100() -> None:
-    names = {"bars:test": 1500, "mazes:validation": 1500, "barn": 1000, "A": None}
-    assert {name: world_tasks(name, episodes=1)[0].max_steps for name in names} == names
-    found = evaluate(circle, "rooms:test", episodes=1, physics="kinematic", max_steps=20)
-    assert found[0].timeout and found[0].time_s == pytest.approx(150.0)
+def test_barn_has_100_seconds_and_other_tasks_what_is_asked_for() -> None:
+    limits = {"bars:test": 2.0, "mazes:validation": 2.0, "barn": 100.0, "A": 2.0}
+    for name, limit in limits.items():
+        (found,) = evaluate(circle, name, episodes=1, physics="kinematic", max_steps=20)
+        assert found.timeout and found.time_s == pytest.approx(limit)
 
 
-def test_a_slower_robot_has_longer_in_proportion_to_its_speed() -> None:
-    for robot, steps in {"kobuki": 1500, "turtlebot4": 2451, "burger": 3409}.items():
-        assert world_tasks("bars:test", episodes=1, robot=robot)[0].max_steps == steps
+@pytest.mark.parametrize("world", ["rooms:test", "A"])
+@pytest.mark.parametrize(("robot", "limit"), [("kobuki", 150.0), ("burger", 477.3)])
+def test_every_robot_has_the_time_for_105_m_at_full_speed(
+    world: str, robot: str, limit: float
+) -> None:
+    found = evaluate(stand, world, episodes=1, physics="kinematic", robot=robot)
+    assert [(each.outcome, round(each.time_s, 1)) for each in found] == [("standstill", limit)]
+
+
+def test_a_robot_stands_still_that_turns_on_the_spot_but_not_one_that_drives() -> None:
+    arguments: dict[str, Any] = {"physics": "kinematic", "robot": "kobuki", "max_steps": 150}
+    around = {"turns": circle, "stands": stand, "drives": lambda _: np.array([0.2, 0.8])}
+    ends = [evaluate(driver, "A", episodes=1, **arguments)[0] for driver in around.values()]
+    assert [end.outcome for end in ends] == ["standstill", "standstill", "timeout"]
+    assert all(end.timeout for end in ends)
+    summary = summarize(ends)
+    assert (summary["timeout"].value, summary["standstill"].value) == (1.0, 2 / 3)
+    short = evaluate(stand, "A", episodes=1, **{**arguments, "max_steps": 50})
+    assert short[0].outcome == "timeout"  # Ten seconds are needed to tell.
 
 
 def test_a_time_limit_is_in_seconds_whatever_the_time_step() -> None:
@@ -305,7 +325,7 @@ def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
     assert policy.card["method"] == "mpfa_per"
     memory = {} if name == "td3-paper" else {"memory": "map"}
     assert set(policy.env_arguments) - {"history"} == {
-        "robot", "physics", "max_steps", "action_repeat", "closeness_distance", *memory,
+        "robot", "physics", "action_repeat", "closeness_distance", *memory,
     }  # fmt: skip
     assert policy.env_arguments.items() >= memory.items()
     results = evaluate(policy, "D", episodes=10, seed=4711, physics="kinematic")

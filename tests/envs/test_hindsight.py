@@ -61,7 +61,7 @@ def test_rows_of_another_goal_are_those_of_an_environment_that_has_it(memory):
     "task",
     [
         {"world": "mixed", "memory": "map", "noise": {"range_noise": 0.02, "dropout": 0.05}},
-        {"world": "mixed", "memory": "map", "noise": {"drift": 0.1, "slip": 0.1, "latency": 1}},
+        {"world": "mixed", "memory": "map", "noise": {"drift": 0.1, "slip": 0.1}, "latency": 0.15},
         {"world": "crowd", "memory": "map", "history": 2},
         {"world": "mixed", "robot": "burger", "lidar": {"reduction": "median"}},
     ],

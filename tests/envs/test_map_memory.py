@@ -188,6 +188,19 @@ def test_the_path_leads_round_a_wall_however_long_that_is() -> None:
     assert not sketch.blocked[places[:, 0], places[:, 1]].any()
 
 
+def test_beside_the_end_of_a_wall_the_path_never_leads_through_the_wall() -> None:
+    wall = World(name="wall", size=(8.0, 8.0), boxes=(Box(-0.1, 0.0, 0.1, 3.0),))
+    lidar = Lidar(wall, sectors=36, rays_per_sector=3, field_of_view=360.0)
+    for clearance in (0.01, 0.02, 0.03, 0.05, 0.06):
+        pose = 0.1 + ROBOT.radius + clearance, 2.6, 0.5 * math.pi
+        memory = MapMemory(1, ROBOT, lidar)
+        memory.begin(0, wall)
+        scan(memory, lidar, pose, (-2.5, 1.5))
+        ahead, left, _ = scan(memory, lidar, pose, (-2.5, 1.5))
+        # The wall is to the left, its end ahead.
+        assert abs(math.atan2(left, ahead)) < math.radians(80.0)
+
+
 def test_the_map_extends_the_observation_and_changes_nothing_else() -> None:
     worlds = [generate_world("mazes", 3), generate_world("halls", 4)]
     envs = [

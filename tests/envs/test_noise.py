@@ -16,7 +16,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.robots.noise import NoisyMotion
 
-ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
+ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, drift=0.05)
 AHEAD = Task((-4.0, 0.0, 0.0), (4.0, 0.0))
 KINEMATIC = {"physics": "kinematic"}
 
@@ -50,14 +50,65 @@ def test_without_noise_nothing_is_added(noise):
 def test_late_actions_are_those_that_were_told_before():
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, (30, 2))
     _, prompt = drive(None, actions, action_repeat=1)
-    _, late = drive(RobotNoise(latency=3), actions, action_repeat=1)
+    _, late = drive(None, actions, action_repeat=1, latency=0.3)
     np.testing.assert_allclose(places(late)[:4], [AHEAD.start] * 4)  # It stands.
     np.testing.assert_allclose(places(late)[3:], places(prompt)[:-3], atol=1e-12)
 
 
-def test_latency_counts_time_steps_and_not_decisions():
-    _, late = drive(RobotNoise(latency=3), np.ones((4, 2)), action_repeat=2)
-    np.testing.assert_allclose(places(late)[:, 0] + 4.0, [0.0, 0.0, 0.05, 0.15, 0.25], atol=1e-12)
+@pytest.mark.parametrize(("latency", "lost"), [(0.3, 0.15), (0.22, 0.1), (0.02, 0.0)])
+def test_latency_counts_seconds_and_not_decisions(latency, lost):
+    _, late = drive(None, np.ones((4, 2)), action_repeat=2, latency=latency)
+    told = np.maximum(0.1 * np.arange(5.0) - lost, 0.0)
+    np.testing.assert_allclose(places(late)[:, 0] + 4.0, told, atol=1e-12)
+
+
+def test_a_range_of_latencies_is_sampled_for_each_episode():
+    env = VectorNavigationEnv(300, world="A", latency=(0.1, 0.3), **KINEMATIC)
+    env.reset(seed=0)
+    env.step(np.ones((300, 2)))
+    driven = np.linalg.norm(env.poses[:, :2] - [task.start[:2] for task in env.tasks], axis=1)
+    # A quarter is 0.1 s late.
+    assert set(np.unique(driven.round(9))) == {0.0, 0.05}
+    assert (driven > 0.0).mean() == pytest.approx(0.25, abs=0.1)
+
+
+@pytest.mark.parametrize("latency", [-0.1, (0.3, 0.1), 3.0, "soon", (0.1, 0.2, 0.3)])
+def test_a_latency_out_of_range_is_rejected(latency):
+    with pytest.raises(ValueError, match=r"latency must be seconds in \[0, 2\], or the least"):
+        VectorNavigationEnv(1, latency=latency, **KINEMATIC)
+
+
+def test_latency_in_the_noise_of_earlier_versions_is_rejected_unless_it_is_none():
+    assert VectorNavigationEnv(1, noise={"slip": 0.1, "latency": 0}, **KINEMATIC)
+    with pytest.raises(ValueError, match=r"noise must not hold 'latency', got .*beside noise"):
+        VectorNavigationEnv(1, noise={"latency": 1}, **KINEMATIC)
+
+
+@pytest.mark.parametrize("latency", [0.1, 0.25])
+def test_what_is_observed_is_where_the_robot_is_when_its_order_acts(latency):
+    arguments = {"world": "B", "robot": "kobuki", "memory": "map", "latency": latency}
+    actions = np.random.default_rng(5).uniform(-0.2, 1.0, (12, 2)).repeat(2, axis=0)
+    env = NavigationEnv(action_repeat=1, time_step=0.05, **arguments, **KINEMATIC)
+    seen, _ = env.reset(seed=3)
+    rows, motions = [seen], [env.motion]
+    for action in actions:
+        seen, *_ = env.step(action)
+        rows.append(seen)
+        motions.append(env.motion)
+    steps = round(latency / 0.05)
+    for row, motion in zip(rows[:-steps], motions[steps:], strict=True):
+        x, y, heading, forward, _ = motion
+        goal = env.task.goal
+        bearing = math.atan2(goal[1] - y, goal[0] - x) - heading
+        np.testing.assert_allclose(
+            row[env.config.observation_slices["goal_direction"]],
+            [math.cos(bearing), math.sin(bearing)],
+            atol=1e-4,
+        )
+        distance = row[env.config.observation_slices["goal_distance"]][0] * 10.0
+        assert distance == pytest.approx(math.dist((x, y), goal), abs=1e-4)
+        speeds = row[env.config.observation_slices["linear_speed"]][0] * 0.7
+        assert speeds == pytest.approx(forward, abs=1e-6)
 
 
 def test_a_wheel_slips_by_its_share_unseen_by_odometry():
@@ -134,5 +185,5 @@ def test_a_seed_has_its_noise():
 
 
 def test_twice_the_noise_is_twice_each():
-    assert ALL.times(2) == RobotNoise(range_noise=0.06, dropout=0.1, slip=0.2, latency=4, drift=0.1)
+    assert ALL.times(2) == RobotNoise(range_noise=0.06, dropout=0.1, slip=0.2, drift=0.1)
     assert ALL.times(0) == RobotNoise()

@@ -161,7 +161,6 @@ NOISE: Rows = [
     ({"range_noise": -0.1}, "range_noise must not be negative, got -0.1"),
     ({"drift": math.nan}, "drift must be a finite number, got nan"),
     ({"dropout": 1.5}, r"dropout must be in \[0, 1\], got 1.5"),
-    ({"latency": 0.5}, "latency must be an integer of at least 0, got 0.5"),
 ]
 LIDAR: Rows = [
     ({"field_of_view": 0.0}, "field_of_view must be positive, got 0.0"),
@@ -287,7 +286,6 @@ def evaluated(**arguments: Any) -> object:
         (one, "max_steps"),
         (one, "action_repeat"),
         (Mirror, "sectors"),
-        (RobotNoise, "latency"),
         (partial(Lidar, WORLDS["A"]), "rays_per_sector"),
         (of_a_policy, "history"),
         (of_a_policy, "max_steps"),
@@ -305,7 +303,6 @@ def test_a_count_beyond_bounds_is_rejected_at_once(make: Callable[..., object], 
         (r"sectors \* rays_per_sector", partial(Lidar, WORLDS["A"]), {"sectors": 99_999}),
         (r"sectors \* history", of_a_policy, {"history": 99_999}),
         ("sectors", of_a_policy, {"lidar": {"sectors": 2**31}}),
-        ("latency", of_a_policy, {"noise": {"latency": 2**31}}),
     ],
 )
 def test_counts_that_multiply_or_lie_within_are_bounded_too(

@@ -83,8 +83,8 @@ def test_a_long_room_gives_a_long_picture() -> None:
 
 def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
     world = World(name="narrow", size=(2.6, 20.0))
-    ends = ["success", "collision", "timeout"]
-    picture = render_trajectories(world, [[]] * 3, [(0, 0)] * 3, ends, title="narrow", size=360)
+    ends = list(OUTCOMES)
+    picture = render_trajectories(world, [[]] * 4, [(0, 0)] * 4, ends, title="narrow", size=360)
     footer = picture[360:].astype(int)
     for color in OUTCOMES.values():
         assert (abs(footer - color[:3]).sum(-1) < 10).sum() > 50

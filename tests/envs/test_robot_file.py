@@ -31,7 +31,7 @@ from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 
 CART = load_robot(EXAMPLE_ROBOT)
-UNIT = re.compile(r"\[(?:[^\[\]]*\b)?(m|kg|deg|m/s|m/s²|rad/s|m, m, rad)\]$")
+UNIT = re.compile(r"\[(?:[^\[\]]*\b)?(m|kg|deg|s|m/s|m/s²|rad/s|m, m, rad)\]$")
 
 
 def changed(line: str) -> str:
@@ -173,7 +173,7 @@ def test_the_lidar_of_the_task_is_that_of_the_robot(
 
 @pytest.mark.parametrize("robot", ["kobuki", CART, str(EXAMPLE_ROBOT)])
 def test_a_policys_file_alone_drives_its_robot(robot: RobotChoice, tmp_path: Path) -> None:
-    task = {"robot": robot, "physics": "kinematic", "max_steps": 20}
+    task = {"robot": robot, "physics": "kinematic"}
     size = max(part.stop for part in TaskConfig(**task).observation_slices.values())
     layers = [Linear(np.zeros((2, size), np.float32), np.ones(2, np.float32))]
     policy = Policy(layers, env_arguments=task)
@@ -181,8 +181,8 @@ def test_a_policys_file_alone_drives_its_robot(robot: RobotChoice, tmp_path: Pat
     loaded = load_policy(tmp_path)
     assert resolve_robot(loaded.env_arguments["robot"]) == resolve_robot(robot)
     assert loaded.env_arguments["robot"]["radius"] == resolve_robot(robot).radius
-    found = evaluate(loaded, "rooms:validation", episodes=2)
-    assert found == evaluate(policy, "rooms:validation", episodes=2)
+    found = evaluate(loaded, "rooms:validation", episodes=2, max_steps=20)
+    assert found == evaluate(policy, "rooms:validation", episodes=2, max_steps=20)
 
 
 def test_a_policy_of_an_unknown_robot_is_rejected() -> None:

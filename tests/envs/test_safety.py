@@ -58,11 +58,12 @@ def drive_at_random(
     physics: str,
     robots: int,
     view: float = 360.0,
+    latency: Any = None,
 ) -> float:
     """Least clearance of robots that hold a random action for a while [m]."""
     near = ROBOTS[robot].radius if isinstance(robot, str) else robot.radius
     arguments = {"robot": robot, "physics": physics, "closeness_distance": near, "max_steps": 400}
-    arguments |= {"contact": True}
+    arguments |= {"contact": True, "latency": latency}
     arguments["lidar"] = {"field_of_view": view, "sectors": round(view / 10.0)}
     keep = TaskConfig(**arguments).make_filter()
     rng = np.random.default_rng(0)
@@ -175,6 +176,23 @@ def test_what_is_too_near_may_be_passed_but_not_approached(gap: float) -> None:
     before[17:19] = config.robot.radius + gap
     assert keep(observed(config, before), slowly).sum() <= 0.0
     assert np.array_equal(keep(observed(config, before), -slowly), -slowly)
+
+
+@pytest.mark.parametrize("action", [(0.1, 0.1), (0.0, 0.0), (-0.3, 0.3)])
+def test_a_robot_that_has_crept_too_near_is_ordered_away(action: tuple[float, float]) -> None:
+    config = TaskConfig(**task())
+    keep, before = config.make_filter(), np.full(36, 5.0)
+    for gap, leaves in ((0.002, True), (0.012, False)):
+        before[17:19] = config.robot.radius + gap
+        ordered = keep(observed(config, before), np.array(action, np.float32))
+        assert (ordered.sum() < -0.01) == leaves
+
+
+@pytest.mark.parametrize("latency", [0.1, 0.3, (0.0, 0.25)])
+@pytest.mark.parametrize("world", ["mazes", "rooms"])
+def test_a_random_policy_with_late_orders_touches_nothing(world: str, latency: Any) -> None:
+    arguments = {"physics": "kinematic", "robots": 20, "latency": latency}
+    assert drive_at_random("kobuki", world, 4_000, **arguments) > 0.0
 
 
 def test_what_is_nearer_than_the_observation_tells_may_be_at_the_rim() -> None:

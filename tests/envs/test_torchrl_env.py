@@ -198,8 +198,14 @@ def test_info_keys_choose_what_is_handed_on() -> None:
 
 
 def test_the_specs_hold_in_generated_worlds_with_history_and_noise() -> None:
-    noise = {"latency": 1, "slip": 0.1}
-    task = {"progress": "shortest_path", "max_steps": 20, "history": 2, "noise": noise}
+    noise = {"slip": 0.1}
+    task = {
+        "progress": "shortest_path",
+        "max_steps": 20,
+        "history": 2,
+        "noise": noise,
+        "latency": 0.1,
+    }
     env = make_navigation_env("mixed", num_envs=3, physics="kinematic", seed=0, **task)
     check_env_specs(env)
     assert env.env.config.noise == RobotNoise(**noise)

@@ -31,7 +31,7 @@ from tests.envs.plain_robot import PlainRobot
 from tests.envs.shapes import SCATTERED, random_shapes
 
 NAMES = ["A", "B", "D", "test"]
-ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
+ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, drift=0.05)
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
 
 
@@ -87,7 +87,7 @@ ALONE: list[dict[str, Any]] = [
     {"history": 3, "memory": "map"},
     {"noise": ALL, "history": 1},
     {"noise": ALL, "memory": "map"},
-    {"noise": RobotNoise(latency=3)},
+    {"latency": 0.25},
     {"noise": RobotNoise(drift=0.1), "memory": "map"},
     {"noise": RobotNoise(slip=0.2)},
     {"world": [BUSY] * 4, "contact": True},

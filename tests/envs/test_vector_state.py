@@ -29,7 +29,7 @@ from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
 from tests.envs.busy import BUSY, POLITE, STANDING, needs
 from tests.envs.shapes import SCATTERED, random_shapes
 
-ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
+ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, drift=0.05)
 GIVEN = {"worlds": [BUSY, None, "B"], "tasks": [Task((0.0, -1.0, 1.0), (0.0, 3.0)), None, None]}
 CASES: dict[str, dict[str, Any]] = {
     "worlds": {"world": ["B", "D", "test"], "action_repeat": 3},
@@ -162,9 +162,9 @@ SPOILED: list[tuple[Callable[[Any], None], str]] = [
     (value(3, "robots", 0, "task"), "task must be a start and a goal, got 3"),
     (value(FAR, "robots", 1, "task"), "robot 1: "),
     (value([[0.0]], "robots", 0, "speeds"), "cannot reshape"),
-    (value([[9.0, 0.0]], "robots", 0, "speeds"), "speeds .* at most 250 pairs from .* to 0.5"),
+    (value([[9.0, 0.0]], "robots", 0, "speeds"), "speeds .* at most 1050 pairs from .* to 0.5"),
     (value([[np.nan, 0.0]], "robots", 0, "speeds"), r"speeds .* \[nan\]"),
-    (value(np.zeros((999, 2)), "robots", 0, "speeds"), "speeds .* at most 250 pairs"),
+    (value(np.zeros((1999, 2)), "robots", 0, "speeds"), "speeds .* at most 1050 pairs"),
     (value(np.full((250, 2), 0.5), "robots", 0, "speeds"), r"continue after .* robots \[0\]"),
     (value(lambda speeds: speeds[:-1], "robots", 1, "speeds"), "end elsewhere"),
     (value(lambda speeds: speeds[::-1], "robots", 1, "speeds"), "end elsewhere"),

@@ -168,14 +168,16 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
     (job.path / files.STATUS).write_text('{"finished": true}')
     how = [str(job.path), "--worlds", "A", "--episodes", "1", "--no-pictures"]
     study = ["--output", str(job.results(asked))]
-    others = (["--seed", "3"], ["--noise", "slip=0.1,latency=1"], ["--robot", "turtlebot2"])
+    others = (
+        ["--seed", "3"], ["--noise", "slip=0.1"], ["--latency", "0.1"], ["--robot", "turtlebot2"],
+    )  # fmt: skip
     evaluate.main(how)
     assert job.is_evaluated(asked)
     for other in others:
         evaluate.main([*how, *other])
         assert job.is_evaluated(asked)
     names = {path.name.removeprefix("evaluation-A-") for path in job.path.glob("evaluation-*")}
-    changed = {"seed3", "slip0.1-latency1", "turtlebot2"}
+    changed = {"seed3", "slip0.1", "latency0.1", "turtlebot2"}
     assert names == {"kinematic", *(f"kinematic-{each}" for each in changed)}
     for other in others:
         evaluate.main([*how, *other, *study])

@@ -31,7 +31,8 @@ class MapPath:
         self._center = np.zeros(2)
         # The loops are compiled by their first call, which takes seconds.
         self.begin((0.0, 0.0))
-        self.sense((0.0, 0.0, 0.0), (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
+        here = np.zeros(3)
+        self.sense(here, here, (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
     def begin(self, center: tuple[float, float]) -> None:
         """Begin an empty map around a place [m]."""
@@ -43,11 +44,17 @@ class MapPath:
         self._memory.arrays.costs[0] = UNKNOWN
 
     def sense(
-        self, pose: tuple[float, float, float], goal: tuple[float, float], points: Points
+        self,
+        pose: NDArray[np.float64],
+        taken: NDArray[np.float64],
+        goal: tuple[float, float],
+        points: Points,
     ) -> NDArray[np.float64]:
-        """Enter points; direction (x, y) for the robot and length of the path, ``[1, 3]``."""
-        motion = np.zeros((1, 5))
-        motion[0, :2], motion[0, 2] = np.subtract(pose[:2], self._center), pose[2]
+        """Enter points taken at a pose; direction (x, y) and length of the path, ``[1, 3]``."""
+        poses = np.zeros((2, 1, 5))
+        poses[:, 0, :3] = pose[:3], taken[:3]
+        poses[:, 0, :2] -= self._center
         goals = np.subtract(goal, self._center)[None]
         directions = np.stack((np.cos(points.angles), np.sin(points.angles)))
-        return self._memory.remember(motion, goals, points.ranges[None], directions=directions)
+        ranges = points.ranges[None]
+        return self._memory.remember(poses[0], goals, ranges, directions=directions, taken=poses[1])

@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import MEANT, check_positive, check_share
+from mpfa_envs.checks import MEANT, check_not_negative, check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
+from mpfa_envs.deploy.pace import fastest_pace, tolerance, wheel_range, widening
 from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
-from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.deploy.way_back import WayBack
+from mpfa_envs.robots.orders import STRENGTH, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
-from mpfa_envs.sensing.observation_loops import observe_all
+from mpfa_envs.sensing.observation_loops import look_from, observe_all
 
 if TYPE_CHECKING:
     import os
@@ -38,8 +40,8 @@ _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
 """Side of the square around a robot in which its goal must be, without a map, too [m]."""
-_BEYOND: Final = 0.02
-"""Share of its speed range by which a wheel's command may exceed it."""
+_REDUCED: Final = 3
+"""Rays of a sector of a scan that is seen from another pose."""
 
 
 class Command(NamedTuple):
@@ -80,6 +82,10 @@ class Pilot:
             position; the path leads through it alone.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
+        latency: Time from a scan to the moment at which the wheels take the order that follows from
+            it [s]; None: that of the robot. The pilot drives the orders under way first, and
+            decides for the state that it comes to; its filter allows for an error of 0.05 s, and
+            for wheels that are slower by a fifth.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -99,6 +105,7 @@ class Pilot:
         silent: Silent = "reject",
         map_size: float = 40.0,
         clearance: float | None = None,
+        latency: float | None = None,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -108,7 +115,7 @@ class Pilot:
                 f"the policy learned with a robot of radius {learned.radius} m, "
                 f"{self.robot.name} has {self.robot.radius} m"
             )
-        most = _fastest_pace(self.robot, learned)
+        most = fastest_pace(self.robot, learned)
         self.pace = most if pace is None else check_share("pace", pace)
         if not 0.0 < self.pace <= most:
             raise ValueError(
@@ -117,13 +124,15 @@ class Pilot:
                 f"rad/s and changes its wheels' speed by {self.robot.wheel_limits.acceleration} "
                 f"m/s², got {pace}"
             )
-        least = self.pace * _wheel_range(self.robot, learned)[0]
-        if least < self.robot.min_wheel_speed - _tolerance(self.robot):
+        least = self.pace * wheel_range(self.robot, learned)[0]
+        if least < self.robot.min_wheel_speed - tolerance(self.robot):
             raise CardError(
                 f"on the sharpest arcs of the policy a wheel of {self.robot.name} would turn at "
                 f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
                 "policy with it, or give a lower min_wheel_speed if its wheels can do that"
             )
+        self.latency = self.robot.latency if latency is None else latency
+        check_not_negative("latency", self.latency)
         mount = self.robot.lidar_mount if mount is None else mount
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
@@ -144,6 +153,8 @@ class Pilot:
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
+        self._way_back = WayBack(learned, self.period)
+        self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
     @classmethod
@@ -171,6 +182,11 @@ class Pilot:
         return self.card.period / self.pace
 
     @property
+    def has_filter(self) -> bool:
+        """True if a filter keeps the robot off what it sees."""
+        return self._keep is not None
+
+    @property
     def goal(self) -> tuple[float, float] | None:
         """The goal (x, y) [m]; None without."""
         return self._goal
@@ -192,6 +208,7 @@ class Pilot:
         goal = _pair("goal", goal)
         self._check_on_map(goal, center)
         self._goal, self._center, self._fresh = goal, center, True
+        self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
         """Give up the goal."""
@@ -226,15 +243,20 @@ class Pilot:
         speeds: tuple[float, float],
         *,
         scan_pose: tuple[float, float, float] | None = None,
+        time: float | None = None,
+        age: float = 0.0,
     ) -> NDArray[np.float32]:
         """Build the policy's observation, once for each decision.
+
+        The robot is taken to stop then, unless :meth:`give` names its order.
 
         Args:
             scan: What the lidar has measured.
             pose: Of the robot (x, y, heading) in the frame of the odometry [m, m, rad].
             speeds: Forward and turning speed [m/s, rad/s].
-            scan_pose: Pose at the time of the scan, from which it is entered in the map; None: it
-                is of now.
+            scan_pose: Pose at the time of the scan; None: it is of now.
+            time: Time of the decision [s]; None: a period after the last one.
+            age: Age of pose and speeds then [s].
 
         Returns:
             The observation, ``[O]``.
@@ -243,13 +265,31 @@ class Pilot:
             ScanError: If the scan lacks the range of a sector.
             ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
+        return self._observe(scan, pose, speeds, scan_pose, time, age)[0]
+
+    def _observe(
+        self,
+        scan: Scan,
+        pose: tuple[float, float, float],
+        speeds: tuple[float, float],
+        scan_pose: tuple[float, float, float] | None,
+        time: float | None,
+        age: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+        """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
         if self._goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
         _pair("pose", (x, y))
-        linear, angular = check_finite("speeds", speeds, 2)
+        motion = np.array((x, y, heading, *check_finite("speeds", speeds, 2)))
+        taken = np.array(check_finite("scan_pose", scan_pose or (x, y, heading), 3))
+        self._time = self._time + self.period if time is None else time
+        ahead = self._orders.states(
+            motion, age, self._time, self.latency, certain=not self.has_filter
+        )
+        # Unless there is another order, as after an error: who gets none stops.
+        self.give(self._time, 0.0, 0.0)
         card = self.card
-        taken = (x, y, heading) if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
         center = self._center or (x, y)
         self._check_on_map(self._goal, center)
         ranges, points = self.sectors.read(scan)
@@ -258,26 +298,44 @@ class Pilot:
             if self._fresh:
                 self._map.begin(center)
                 self._center = center
-            if taken != (x, y, heading):
-                points = points.seen_from((x, y, heading), taken, card.max_range)
-            path = self._map.sense((x, y, heading), self._goal, points)
+            path = self._map.sense(ahead[0], taken, self._goal, points)
         robot = card.robot
-        observe_all(
-            np.array([[x, y, heading, linear / self.pace, angular / self.pace]]),
-            np.array([self._goal]),
-            np.array([math.dist((x, y), self._goal)]),
-            np.array([self._fresh]),
-            np.ones(1, dtype=np.bool_),
-            ranges[None],
-            False,
-            (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
-            path,
-            card.sectors,
-            card.history,
-            self._observation,
-        )
+        rows = []
+        for state in ahead:
+            seen = ranges
+            if (state[:3] != taken).any():
+                seen = np.empty(card.sectors * (1 if card.reduction == "single" else _REDUCED))
+                view = math.radians(card.field_of_view)
+                look_from(state[:3], *points, taken, card.max_range, view, seen)
+            observation = self._observation.copy()
+            observe_all(
+                np.array([[*state[:3], *(state[3:] / self.pace)]]),
+                np.array([self._goal]),
+                np.array([math.dist(state[:2], self._goal)]),
+                np.array([self._fresh]),
+                np.ones(1, dtype=np.bool_),
+                seen[None],
+                card.reduction == "median",
+                (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
+                path,
+                card.sectors,
+                card.history,
+                observation,
+            )
+            rows.append(observation[0])
+        self._observation[0] = rows[0]
         self._fresh = False
-        return self._observation[0].copy()
+        return rows[0], np.array(rows), float(ahead[0, 2] - taken[2])
+
+    def give(self, time: float, linear: float, angular: float) -> None:
+        """Remember what was ordered, where that is not what the pilot has decided.
+
+        Args:
+            time: When it was ordered, by the clock of the decisions [s].
+            linear: Forward speed [m/s].
+            angular: Turning speed [rad/s].
+        """
+        self._orders.give(time, linear, angular)
 
     def decide(
         self,
@@ -286,6 +344,8 @@ class Pilot:
         speeds: tuple[float, float],
         *,
         scan_pose: tuple[float, float, float] | None = None,
+        time: float | None = None,
+        age: float = 0.0,
     ) -> Command:
         """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
 
@@ -295,31 +355,39 @@ class Pilot:
         Raises:
             ScanError: Also if it would drive where it does not see and cannot turn on the spot.
         """
-        observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
-        blind, hidden = self.sectors.blind(scan)
+        observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
+        blind, hidden = self.sectors.blind(scan, turn)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         learned = self.card.robot
-        left, right = learned.wheel_speeds(action)
+        reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
+        back = self._way_back.speeds(pose, self._time, reverses=reverses)
+        left, right = back or learned.wheel_speeds(action)
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         if (np.abs(towards) < _TOWARDS).any():
             left, right = 0.5 * (left - right), 0.5 * (right - left)
         if self._keep is not None:
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
-            observation[: self.card.sectors][hidden] = 1.0
+            states[:, : self.card.sectors][:, hidden] = 1.0
             slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
             action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
-            left, right = learned.wheel_speeds(self._keep(observation, action))
+            left, right = learned.wheel_speeds(self._keep.among(states, action))
         linear = self.pace * 0.5 * (left + right)
         angular = self.pace * (right - left) / learned.wheel_base
         turn = 0.5 * angular * self.robot.wheel_base
-        if linear - abs(turn) < self.robot.min_wheel_speed - _tolerance(self.robot):
+        if linear - abs(turn) < self.robot.min_wheel_speed - tolerance(self.robot):
             raise ScanError(
                 "the scan must reach 45 degrees to both sides of where the robot drives, as with "
                 f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
             )
+        self.give(self._time, linear, angular)
         return Command(linear - turn, linear + turn, linear, angular)
+
+    @property
+    def stands_still(self) -> bool:
+        """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
+        return self._way_back.stands_still
 
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
@@ -350,7 +418,7 @@ class Pilot:
     def _filter(self, clearance: float) -> SafetyFilter:
         """The filter of the task that a policy learned, for the robot that drives."""
         card, learned = self.card, self.card.robot
-        braking = self.robot.wheel_limits.acceleration / _widening(self.robot, learned)
+        braking = self.robot.wheel_limits.acceleration / widening(self.robot, learned)
         braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
         body = replace(
             learned,
@@ -370,6 +438,7 @@ class Pilot:
             time_step=card.period / repeat,
             action_repeat=repeat,
             clearance=clearance,
+            braking=STRENGTH,
         )
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
@@ -382,36 +451,6 @@ class Pilot:
                 f"goal must be on the map, {side:g} m{name} around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
-
-
-def _widening(robot: RobotModel, learned: RobotModel) -> float:
-    """Ratio of wheel speed differences to another robot's on the same arc, at least 1."""
-    return max(1.0, robot.wheel_base / learned.wheel_base)
-
-
-def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
-    """Least and greatest speed of its wheels on the arcs of another robot, at its pace [m/s]."""
-    middle = 0.5 * (learned.max_wheel_speed + learned.min_wheel_speed)
-    span = 0.5 * (learned.max_wheel_speed - learned.min_wheel_speed)
-    span *= _widening(robot, learned)
-    return middle - span, middle + span
-
-
-def _tolerance(robot: RobotModel) -> float:
-    """Excess of commanded wheel speeds over their range [m/s]."""
-    return _BEYOND * (robot.max_wheel_speed - robot.min_wheel_speed)
-
-
-def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
-    """The greatest share of the other robot's speed with which it can drive the same arcs."""
-    wheels = (robot.max_wheel_speed + _tolerance(robot)) / _wheel_range(robot, learned)[1]
-    pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
-    if robot.turn_limit is not None:
-        pace = min(pace, robot.turn_limit / learned.max_angular_speed)
-    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
-        needed = learned.wheel_acceleration * _widening(robot, learned)
-        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
-    return pace
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:

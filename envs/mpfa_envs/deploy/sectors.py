@@ -80,16 +80,6 @@ class Points(NamedTuple):
     """Distances from the robot's center [m], ``[P]``; the card's ``max_range`` where nothing was
     met."""
 
-    def seen_from(
-        self, pose: tuple[float, ...], taken: tuple[float, ...], max_range: float
-    ) -> Points:
-        """The points that were met, seen from a pose in place of the one where they were taken."""
-        met = self.ranges < max_range
-        angles = self.angles[met] + taken[2]
-        x = taken[0] - pose[0] + self.ranges[met] * np.cos(angles)
-        y = taken[1] - pose[1] + self.ranges[met] * np.sin(angles)
-        return Points(_wrapped(np.arctan2(y, x) - pose[2]), np.hypot(x, y))
-
 
 class Sectors:
     """Reads scans as a policy does.
@@ -193,11 +183,12 @@ class Sectors:
             np.concatenate((ranges, np.full(silent.size, math.nan))),
         )
 
-    def blind(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def blind(self, scan: Scan, turn: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Find the directions in which a scan does not look, ``unseen`` notwithstanding.
 
         Args:
             scan: What the lidar has measured.
+            turn: Turn of the robot since [rad].
 
         Returns:
             Directions in the robot's frame, 5 degrees apart [rad], ``[D]``; and for each sector
@@ -206,7 +197,7 @@ class Sectors:
         count, step = np.size(scan.ranges), self._side * scan.angle_increment
         middle = self._side * scan.angle_min + self.mount[2] + 0.5 * step * (count - 1)
         half = 0.5 * abs(step) * count + _EDGE
-        directions = _AROUND[np.abs(_wrapped(_AROUND - middle)) > half]
+        directions = _AROUND[np.abs(_wrapped(_AROUND + turn - middle)) > half]
         hidden = np.zeros(self.card.sectors, dtype=np.bool_)
         hidden[self._index(directions[np.abs(directions) <= self._edge])] = True
         return directions, hidden

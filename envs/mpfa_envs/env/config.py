@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -23,6 +23,7 @@ from mpfa_envs.checks import (
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import PAPER_CLEARANCE, ROBOTS, TRAINING_CLEARANCE, RobotModel
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
+from mpfa_envs.robots.orders import LateOrders
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
@@ -39,6 +40,7 @@ Progress = Literal["straight_line", "shortest_path", "none"]
 
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
+        "max_steps": 500,
         "action_repeat": 1,
         "progress_scale": 15.0,
         "clearance": PAPER_CLEARANCE,
@@ -49,6 +51,8 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
 
 The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
 """
+FARTHEST: Final = 105.0
+"""Distance that a robot drives at full speed within its time limit, unless another is given [m]."""
 _MOST_STEPS: Final = 1_000_000
 """Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
@@ -65,6 +69,8 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "min_goal_distance": check_positive,
     "detour_chance": check_share,
 }
+_MOST_LATENCY: Final = 2.0
+"""Greatest latency [s]: where a robot will be later than that is hardly known."""
 _EMPTY: Final = World(name="empty")
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
 _DESCRIBED: Final = ("robot", "clearance", "contact", "reward", "progress_scale", "lidar")
@@ -120,8 +126,9 @@ class TaskConfig:
     """``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on exact arcs,
     several times faster, and needs no PyBullet. Lidar, clearance and collisions are computed from
     the same shapes in both."""
-    max_steps: int = 500
-    """Time limit of an episode in time steps."""
+    max_steps: int = None  # type: ignore[assignment]
+    """Time limit of an episode in time steps. None: the time in which the robot drives
+    :data:`FARTHEST` at full speed, 150 s for a Kobuki."""
     time_step: float = 0.1
     """Duration of a time step [s], in which the robot must not drive farther than its
     :attr:`collision_distance`."""
@@ -157,8 +164,14 @@ class TaskConfig:
     """Number of earlier scans that it senses in addition to the last one, sector by sector: those
     of the decisions before, the newest first, which show what moves."""
     noise: RobotNoise = field(default_factory=RobotNoise)
-    """Errors of the lidar, the wheels, the time and the odometry, none by default: a
+    """Errors of the lidar, the wheels and the odometry, none by default: a
     :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
+    latency: tuple[float, float] = None  # type: ignore[assignment]
+    """Time from a scan to the moment at which the wheels take the order that follows from it [s]: a
+    number, or the least and the greatest, between which it is sampled for each episode; rounded to
+    time steps. The
+    observation is that of the state to which the orders under way bring the robot, as a
+    :class:`~mpfa_envs.deploy.Pilot` observes it. None: that of the robot."""
     closeness_distance: float = None  # type: ignore[assignment]
     """A range of this or less has closeness one [m]. None: the robot's radius and the clearance,
     with ``contact`` too."""
@@ -175,6 +188,11 @@ class TaskConfig:
             clearance = check_not_negative("clearance", self.clearance)
             self._set("closeness_distance", round(robot.radius + clearance, 9))
         self._set("noise", resolve_noise(self.noise))
+        self._set("latency", _read_latency(robot.latency if self.latency is None else self.latency))
+        check_positive("time_step", self.time_step)
+        if self.max_steps is None:
+            limit = FARTHEST / (robot.max_wheel_speed * self.time_step)
+            self._set("max_steps", min(round(limit), _MOST_STEPS))
         for name, check in _CHECKS.items():
             self._set(name, check(name, getattr(self, name)))
         if not self.min_goal_distance > self.goal_radius:
@@ -291,6 +309,13 @@ class TaskConfig:
         base, step = self.robot.wheel_base, self.time_step
         return NoisyMotion(self.noise, robots, wheel_base=base, time_step=step)
 
+    def make_orders(self, robots: int) -> LateOrders | None:
+        """Make the orders under way to some robots, if they are late."""
+        if round(self.latency[1] / self.time_step) == 0:
+            return None
+        step = self.time_step
+        return LateOrders(self.robot, robots, latency=self.latency, time_step=step)
+
     @cached_property
     def reward_function(self) -> RewardFunction:
         """The reward of a time step: the user's, or Eq. (25)."""
@@ -323,8 +348,9 @@ class TaskConfig:
             # The lidar is described below, as the task has it.
             (f"robot.{name}", value and float(value))
             for name, value in robot.items()
-            if not name.startswith("lidar_")
+            if not name.startswith("lidar_") and name != "latency"
         )
+        described["latency"] = list(self.latency) if self.latency[1] > 0.0 else None
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):
@@ -333,6 +359,21 @@ class TaskConfig:
         lidar = self.make_lidar()
         described.update(rays=lidar.angles.size, sectors=lidar.sectors)
         return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}
+
+
+def _read_latency(value: Any) -> tuple[float, float]:
+    """Read a latency, or the least and the greatest [s]."""
+    try:
+        low, high = value if isinstance(value, Sequence) else (value, value)
+        found = check_number("latency", low), check_number("latency", high)
+    except (TypeError, ValueError):
+        found = (-1.0, -1.0)
+    if not 0.0 <= found[0] <= found[1] <= _MOST_LATENCY:
+        raise ValueError(
+            f"latency must be seconds in [0, {_MOST_LATENCY:g}], or the least and the greatest, "
+            f"got {value!r}"
+        )
+    return found
 
 
 def check_names(task: Mapping[str, Any], others: Iterable[str]) -> None:

@@ -84,12 +84,12 @@ class GoalRelabeling:
             robot was within the radius of when the episode began.
         """
         moments = _joined(episode, "hindsight").numpy()
-        positions, motions, ranges = moments[:, :2], moments[:, 4:9], moments[:, 9:]
+        positions, motions = moments[:, :2], moments[:, 4:9]
         goals = positions[steps.cpu().numpy() + 1]
         away = np.linalg.norm(goals[:, None] - positions, axis=2)
         ends = np.argmax(away <= self._config.goal_radius, axis=1)
         goals, ends = goals[ends > 0], ends[ends > 0]
-        paths = self._paths(motions, goals, ranges, ends, moments[0, 2:4])
+        paths = self._paths(moments, goals, ends)
         before = np.concatenate([np.arange(end) for end in ends] or [np.arange(0)])
         of_goal = np.repeat(np.arange(len(ends)), ends)
         last = torch.from_numpy(np.cumsum(ends) - 1)
@@ -116,25 +116,23 @@ class GoalRelabeling:
         return rows
 
     def _paths(
-        self,
-        motions: NDArray[np.float64],
-        goals: NDArray[np.float64],
-        ranges: NDArray[np.float64],
-        ends: NDArray[np.int64],
-        size: NDArray[np.float64],
+        self, moments: NDArray[np.float64], goals: NDArray[np.float64], ends: NDArray[np.int64]
     ) -> NDArray[np.float64] | None:
         """Paths on the robot's map, ``[T + 1, K, 3]``: it is made once more, for each goal."""
         if self._config.memory != "map":
             return None
-        count, world = len(goals), World(name="hindsight", size=(float(size[0]), float(size[1])))
+        count, (width, depth) = len(goals), moments[0, 2:4].tolist()
+        world = World(name="hindsight", size=(width, depth))
         memory = MapMemory(count, self._config.robot, self._lidar)
         for index in range(count):
             memory.begin(index, world)
-        paths = np.zeros((len(motions), count, 3))
+        paths = np.zeros((len(moments), count, 3))
         for step in range(int(ends.max(initial=-1)) + 1):
-            now = np.broadcast_to(motions[step], (count, 5)).copy()
-            scans = np.broadcast_to(ranges[step], (count, ranges.shape[1])).copy()
-            paths[step] = memory.remember(now, goals, scans, ends >= step)
+            now, taken, scans = (
+                np.broadcast_to(moments[step, part], (count, moments[step, part].size)).copy()
+                for part in (slice(4, 9), slice(9, 12), slice(12, None))
+            )
+            paths[step] = memory.remember(now, goals, scans, ends >= step, taken=taken)
         return paths
 
 

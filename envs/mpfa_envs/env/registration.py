@@ -16,7 +16,7 @@ from mpfa_envs.worlds.builtin import WORLDS
 if TYPE_CHECKING:
     from mpfa_envs.env.vector import VectorNavigationEnv
 
-_OF_TIME = ("max_steps", "action_repeat")
+_OF_TIME = ("robot", "max_steps", "time_step", "action_repeat")
 _GENERATED = ("rooms", "clutter", "bars", "fields", "halls", "mazes", "mixed", "crowd")
 _WORLD_OF = {
     f"mpfa/Navigation-{name if name in WORLDS else name.capitalize()}-v1": name

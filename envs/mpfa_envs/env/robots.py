@@ -25,7 +25,7 @@ from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
-from mpfa_envs.sensing.observation_loops import observe_all
+from mpfa_envs.sensing.observation_loops import look_from, observe_all
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.arrays import grown
@@ -90,7 +90,7 @@ class RobotBatch:
         """The physics."""
         self.noise = config.make_noise(count)
         """Errors of the robots' motion, if there are any."""
-        self._held = np.zeros((len(NUMBERS), count))
+        self._orders = config.make_orders(count)
         robot = config.robot
         self._lengths = (
             robot.radius,
@@ -135,6 +135,8 @@ class RobotBatch:
         self.running[index] = True
         if self.noise is not None:
             self.noise.begin(index, (x, y, heading), rng)
+        if self._orders is not None:
+            self._orders.begin(index, rng)
         if self.memory is not None:
             self.memory.begin(index, episode.world)
 
@@ -166,7 +168,8 @@ class RobotBatch:
         disturb = None if noise is None else partial(noise.drive, running=running, rngs=rngs)
         for _ in range(self._config.action_repeat):
             self.walkers.move(running, episodes.motions)
-            self.drives.move(episodes.motions, running, speeds, disturb)
+            due = speeds if self._orders is None else self._orders.arriving(speeds, running)
+            self.drives.move(episodes.motions, running, due, disturb)
             if noise is not None:
                 noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
@@ -244,19 +247,19 @@ class RobotBatch:
         if lidar.is_noisy:
             for index in np.flatnonzero(chosen).tolist():
                 lidar.disturb(ranges[index], rngs[index])
-        held = self._by_odometry()
-        paths = _NO_PATHS
+        here, held = self._motions()
+        seen, paths = self._from(here, held, chosen), _NO_PATHS
         if self.memory is not None:
-            seen = self.walkers.without(self.episodes.motions, lidar, ranges)
-            paths = self.memory.remember(held.motions, held.goals, seen, chosen)
+            standing = self.walkers.without(self.episodes.motions, lidar, ranges)
+            paths = self.memory.remember(held, self.episodes.goals, standing, chosen, taken=here)
         median = lidar.reduction == "median"
         observe_all(
-            held.motions,
-            held.goals,
-            held.numbers[DISTANCE],
-            held.steps == 0,
+            held,
+            self.episodes.goals,
+            self._distances(held),
+            self.episodes.steps == 0,
             chosen,
-            ranges,
+            seen,
             median,
             self._scales,
             paths,
@@ -266,23 +269,51 @@ class RobotBatch:
         )
 
     def moments(self) -> NDArray[np.float64]:
-        """Return the state that hindsight relabeling needs, ``[N, 9 + rays]``.
+        """Return the state that hindsight relabeling needs, ``[N, 12 + rays]``.
 
-        Position (x, y), the room's size, pose and speeds by odometry, and the range of each ray [m,
-        m/s, rad], of which a ray that met a walker has the greatest, as in the robot's map.
+        Position (x, y), the room's size, pose and speeds by odometry as observed, the pose where
+        the scan was taken, and the range of each ray [m, m/s, rad], of which a ray that met a
+        walker has the greatest, as in the robot's map.
         """
-        motions, held = self.episodes.motions, self._by_odometry()
+        motions = self.episodes.motions
+        here, held = self._motions()
         sizes = np.array([world.size for world in self.worlds])
         seen = self.walkers.without(motions, self._lidar, self.ranges)
-        return np.concatenate((motions[:, :2], sizes, held.motions, seen), axis=1)
+        return np.concatenate((motions[:, :2], sizes, held, here[:, :3], seen), axis=1)
 
-    def _by_odometry(self) -> EpisodeArrays:
-        """The episodes with poses, speeds and distances by the robots' odometry."""
-        if self.noise is None or not self.noise.has_odometry:
-            return self.episodes
-        motions = self.noise.odometry
-        self._held[DISTANCE] = np.hypot(*(self.episodes.goals - motions[:, :2]).T)
-        return self.episodes._replace(motions=motions, numbers=self._held)
+    def _motions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """By odometry, motions now and when the next orders act, ``[N, 5]``."""
+        here = self.episodes.motions if self.noise is None else self.noise.odometry
+        return here, here if self._orders is None else self._orders.ahead(here)
+
+    def _distances(self, motions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distances of the goals [m], ``[N]``."""
+        if motions is self.episodes.motions:
+            return self.episodes.numbers[DISTANCE]
+        return np.hypot(*(self.episodes.goals - motions[:, :2]).T)
+
+    def _from(
+        self,
+        here: NDArray[np.float64],
+        held: NDArray[np.float64],
+        chosen: NDArray[np.bool_],
+    ) -> NDArray[np.float64]:
+        """Ranges of the rays as they are where the next orders act [m], ``[N, rays]``."""
+        if here is held:
+            return self.ranges
+        lidar, seen = self._lidar, np.empty_like(self.ranges)
+        view = math.radians(lidar.field_of_view)
+        for index in np.flatnonzero(chosen).tolist():
+            look_from(
+                held[index],
+                lidar.angles,
+                self.ranges[index],
+                here[index],
+                lidar.max_range,
+                view,
+                seen[index],
+            )
+        return seen
 
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m]."""

@@ -117,7 +117,7 @@ class NavigationTorchEnv(EnvBase):
         )
         if self._hindsight:
             self.observation_spec["hindsight"] = Unbounded(
-                shape=(*self.batch_size, self.env.lidar.angles.size + 9), dtype=torch.float64
+                shape=(*self.batch_size, self.env.lidar.angles.size + 12), dtype=torch.float64
             )
         if entries:
             self.observation_spec["info"] = Composite(entries, shape=self.batch_size)

@@ -176,7 +176,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
     @property
     def moments(self) -> NDArray[np.float64]:
-        """State that hindsight relabeling needs, ``[N, 9 + rays]`` [m, m/s, rad]."""
+        """State that hindsight relabeling needs, ``[N, 12 + rays]`` [m, m/s, rad]."""
         return self._batch.moments()
 
     @property

@@ -26,6 +26,7 @@ class EpisodeResult:
     success: bool
     collision: bool
     timeout: bool
+    """True if the time was up, wherever the robot was."""
     time_s: float
     """Simulated time [s]."""
     path_length: float
@@ -54,13 +55,18 @@ class EpisodeResult:
     most 10 s [s]."""
     barn_score: float | None = None
     """Score of the BARN Challenge, see :func:`barn_score`; None where its task is not driven."""
+    standstill: bool = False
+    """True if the time was up and the robot stood still, turning or not, in its last ten
+    seconds."""
 
     @property
-    def outcome(self) -> Literal["success", "collision", "timeout"]:
+    def outcome(self) -> Literal["success", "collision", "timeout", "standstill"]:
         """The name of the episode's end."""
         if self.success:
             return "success"
-        return "collision" if self.collision else "timeout"
+        if self.collision:
+            return "collision"
+        return "standstill" if self.standstill else "timeout"
 
 
 def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
@@ -149,7 +155,8 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         seed: Seed of the bootstrap.
 
     Returns:
-        Estimates by name; success, collision and timeout sum to one. Means of encounters with
+        Estimates by name; success, collision and timeout sum to one, and timeouts of robots that
+        stood still are standstills, too. Means of encounters with
         walkers are among them if there were any, over the episodes with walkers, and so is BARN's
         score, over the episodes of its task.
 
@@ -164,6 +171,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         "success": wilson([result.success for result in results]),
         "collision": wilson([result.collision for result in results]),
         "timeout": wilson([result.timeout for result in results]),
+        "standstill": wilson([result.standstill for result in results]),
         "spl": bootstrap([result.spl for result in results], rng),
         "sct": bootstrap([result.sct for result in results], rng),
         "time_s": bootstrap([result.time_s for result in reached], rng),

@@ -23,6 +23,7 @@ from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.robots.standing import stands_still
 from mpfa_envs.tasks.sets import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
@@ -161,7 +162,7 @@ def evaluate(
         progress_bar: If True, show one.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv` in place of
             ``policy.env_arguments``; ``max_steps`` counts where a task has no time limit of its
-            own, as those of generators and of the benchmark have.
+            own, as those of the benchmark have.
 
     Returns:
         One result an episode, world by world. Those of a world are the same whichever others are
@@ -340,8 +341,7 @@ def _drive(
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
             number, at_work[robot] = int(at_work[robot]), -1
             times = float(planned[robot]), float(decided[robot] / decisions[robot])
-            speed = env.config.robot.max_wheel_speed
-            yield robot, number, _result(tasks, number, robot, info, speed, *times)
+            yield robot, number, _result(env, tasks, number, robot, info, *times)
 
 
 def _begin(
@@ -364,11 +364,11 @@ def _begin(
 
 
 def _result(
+    env: VectorNavigationEnv,
     tasks: Sequence[WorldTask],
     number: int,
     robot: int,
     info: dict[str, NDArray[Any]],
-    speed: float,
     plan_s: float,
     decision_s: float,
 ) -> EpisodeResult:
@@ -376,12 +376,14 @@ def _result(
     world, reference = tasks[number].world, tasks[number].reference_path
     time_s = float(info["sim_time"][robot])
     driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
-    success = bool(info["success"][robot])
+    success, timeout = bool(info["success"][robot]), bool(info["timeout"][robot])
+    speed, period = env.config.robot.max_wheel_speed, env.config.time_step
     return EpisodeResult(
         episode=sum(each.world is world for each in tasks[:number]),
         success=success,
         collision=bool(info["collision"][robot]),
-        timeout=bool(info["timeout"][robot]),
+        timeout=timeout,
+        standstill=timeout and stands_still(np.array(env.trail(robot)), period),
         time_s=time_s,
         path_length=driven,
         shortest_path=shortest,

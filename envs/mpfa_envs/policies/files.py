@@ -19,6 +19,8 @@ from mpfa_envs.policies.layers import KINDS, arrays_of
 from mpfa_envs.policies.policy import Policy, PolicyFileError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 FILE_NAME: Final = "policy.npz"
@@ -151,7 +153,12 @@ def _read(content: bytes) -> Policy:
                 if name.startswith(prefix)
             }
             layers.append(kind(**entry, **weights))
-    return Policy(layers, card=about["card"], env_arguments=about["env_arguments"])
+    return Policy(layers, card=about["card"], env_arguments=_for_any_task(about["env_arguments"]))
+
+
+def _for_any_task(env_arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out the time limit, which earlier versions kept: it is the task's."""
+    return {name: value for name, value in env_arguments.items() if name != "max_steps"}
 
 
 def policy_file(path: str | os.PathLike[str]) -> Path:
@@ -177,7 +184,7 @@ class OnnxPolicy(Policy):
         self.observation_size, self.action_size = card.observation_size, card.action_size
         self.layers = ()
         self.card: dict[str, Any] = dict(card.training)
-        self.env_arguments: dict[str, Any] = dict(card.env_arguments)
+        self.env_arguments = _for_any_task(card.env_arguments)
 
     def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         # One at a time: a quantized network takes its scales from all rows of a call.

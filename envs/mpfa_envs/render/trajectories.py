@@ -17,12 +17,15 @@ from mpfa_envs.scene.strip import HEIGHT, Entry, Key, Mark, Title, strip_width, 
 from mpfa_envs.scene.tiles import tiled
 from mpfa_envs.worlds.world import World
 
-Outcome = Literal["success", "collision", "timeout"]
+Outcome = Literal["success", "collision", "timeout", "standstill"]
 """The end of an episode."""
 Trajectories = Sequence["Sequence[Point] | NDArray[np.float64]"]
 """Positions of each episode, each of shape ``[steps, 2]`` [m]."""
 
-_MARKS: dict[str, Mark] = {"success": "box", "collision": "cross", "timeout": "square"}
+_MARKS: dict[str, Mark] = {
+    **{"success": "box", "collision": "cross"},
+    **dict.fromkeys(("timeout", "standstill"), "square"),
+}
 
 
 def render_trajectories(
@@ -48,7 +51,8 @@ def render_trajectories(
         world: A name, the path of a YAML file or a world.
         trajectories: Positions of each episode, each of shape ``[steps, 2]`` [m].
         goals: Goal of each episode (x, y) [m].
-        outcomes: ``"success"``, ``"collision"`` or ``"timeout"`` for each episode.
+        outcomes: ``"success"``, ``"collision"``, ``"timeout"`` or ``"standstill"`` for each
+            episode.
         title: What to write in the strip.
         walkers: Where walkers are at one moment, as in :func:`render_scene`.
         goal_radius: Distance that reaches a goal [m].

@@ -11,6 +11,7 @@ import numpy as np
 from mpfa_envs.checks import (
     check_count,
     check_meant,
+    check_not_negative,
     check_number,
     check_positive,
     did_you_mean,
@@ -63,6 +64,8 @@ class RobotModel:
         lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
             [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. A pilot reads
             scans by it; in training rays begin at the robot's center.
+        latency: Time from a scan to the moment at which the wheels take the order that follows from
+            it [s].
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
@@ -92,6 +95,7 @@ class RobotModel:
     lidar_rays: int | None = None
     lidar_range: float = 10.0
     lidar_mount: tuple[float, ...] = (0.0, 0.0, 0.0)
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -103,8 +107,9 @@ class RobotModel:
             value = getattr(self, field.name)
             if field.name in _CHECKED or (value is None and field.default is None):
                 continue
-            (check_number if field.name == "min_wheel_speed" else check_positive)(field.name, value)
-        keep(self, *(field.name for field in fields(self)[1:-1]))
+            check = {"min_wheel_speed": check_number, "latency": check_not_negative}
+            check.get(field.name, check_positive)(field.name, value)
+        keep(self, *(field.name for field in fields(self)[1:] if field.name != "lidar_mount"))
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from mpfa_envs.compiled import njit
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 
@@ -103,3 +104,34 @@ def drive_arcs(
         heading += 2.0 * half
         motions[robot, 2] = heading - math.tau * round(heading / math.tau)
         motions[robot, 3], motions[robot, 4] = speed, turn
+
+
+@njit
+def drive_orders(
+    motion: NDArray[np.float64],  # (x, y, heading, forward, turning), [5]
+    times: NDArray[np.float64],  # for which each order holds [s], [K]
+    orders: NDArray[np.float64],  # speeds of the wheels [m/s], [K, 2]
+    limits: WheelLimits,
+    wheel_base: float,  # [m]
+    time_step: float,  # longest time for which speeds are held [s]
+) -> NDArray[np.float64]:
+    """The motion, ``[5]``, of a robot that has carried out the orders under way to its wheels."""
+    x, y, heading = motion[0], motion[1], motion[2]
+    across = 0.5 * wheel_base * motion[4]
+    left, right = motion[3] - across, motion[3] + across
+    for order in range(times.shape[0]):
+        if times[order] <= 0.0:
+            continue
+        to_left, to_right = limited(orders[order, 0], orders[order, 1], limits)
+        parts = math.ceil(times[order] / time_step - 1e-9)
+        part = times[order] / parts
+        change = limits.acceleration * part
+        for _ in range(parts):
+            left = min(max(to_left, left - change), left + change)
+            right = min(max(to_right, right - change), right + change)
+            turn, along = (right - left) / wheel_base * part, 0.5 * (left + right) * part
+            x += along * math.cos(heading + 0.5 * turn)
+            y += along * math.sin(heading + 0.5 * turn)
+            heading += turn
+    heading -= math.tau * round(heading / math.tau)
+    return np.array((x, y, heading, 0.5 * (left + right), (right - left) / wheel_base))

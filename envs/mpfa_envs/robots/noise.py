@@ -1,4 +1,4 @@
-"""Errors of a real robot: of lidar, wheels, time and odometry."""
+"""Errors of a real robot: of lidar, wheels and odometry."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_not_negative, check_number, check_share, keep
+from mpfa_envs.checks import check_not_negative, check_number, check_share, keep
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,8 +29,6 @@ class RobotNoise:
         slip: Mean share of its path that a wheel loses, uniform from none to twice this, sampled
             for each wheel and time step. Odometry, which counts the turns of the wheels, does not
             see it.
-        latency: Time steps after which an action reaches the wheels; until the first one does, the
-            robot stands.
         drift: Standard deviation of the share by which odometry measures paths too long or too
             short, and of that by which it measures turns; the two are sampled for each episode. The
             goal's direction and distance, the speeds and the robot's map are by odometry.
@@ -40,17 +38,16 @@ class RobotNoise:
 
     Examples:
         >>> from mpfa_envs import NavigationEnv, RobotNoise
-        >>> noise = RobotNoise(range_noise=0.02, dropout=0.02, slip=0.05, latency=1, drift=0.02)
+        >>> noise = RobotNoise(range_noise=0.02, dropout=0.02, slip=0.05, drift=0.02)
         >>> env = NavigationEnv(world="B", physics="kinematic", noise=noise)
         >>> observation, info = env.reset(seed=0)
-        >>> noise.times(2).slip, noise.times(2).latency
-        (0.1, 2)
+        >>> noise.times(2).slip
+        0.1
     """
 
     range_noise: float = 0.0
     dropout: float = 0.0
     slip: float = 0.0
-    latency: int = 0
     drift: float = 0.0
 
     def __post_init__(self) -> None:
@@ -59,14 +56,13 @@ class RobotNoise:
         check_share("dropout", self.dropout)
         if not 0.0 <= check_number("slip", self.slip) <= _MOST_SLIP:
             raise ValueError(f"slip must be in [0, {_MOST_SLIP}], got {self.slip!r}")
-        check_count("latency", self.latency, least=0)
         keep(self, *vars(self))
 
     def times(self, factor: float) -> RobotNoise:
         """Scale all errors.
 
         Args:
-            factor: What they are multiplied by; time steps are rounded.
+            factor: What they are multiplied by.
 
         Returns:
             The scaled noise.
@@ -74,13 +70,12 @@ class RobotNoise:
         Raises:
             ValueError: If an error is out of its range then.
         """
-        scaled = {name: factor * value for name, value in asdict(self).items()}
-        return RobotNoise(**{**scaled, "latency": round(scaled["latency"])})
+        return RobotNoise(**{name: factor * value for name, value in asdict(self).items()})
 
     @property
     def is_in_motion(self) -> bool:
         """True if more than the lidar is noisy."""
-        return self.slip > 0.0 or self.latency > 0 or self.drift > 0.0
+        return self.slip > 0.0 or self.drift > 0.0
 
 
 def resolve_noise(noise: RobotNoise | Mapping[str, Any] | None) -> RobotNoise:
@@ -89,16 +84,21 @@ def resolve_noise(noise: RobotNoise | Mapping[str, Any] | None) -> RobotNoise:
         return RobotNoise()
     if isinstance(noise, RobotNoise):
         return noise
+    if isinstance(noise, Mapping) and noise.get("latency"):
+        raise ValueError(
+            f"noise must not hold 'latency', got {noise}: give latency [s] beside noise"
+        )
     try:
-        return RobotNoise(**noise)
-    except TypeError as error:
+        # Versions before had it here, in time steps.
+        return RobotNoise(**{name: value for name, value in noise.items() if name != "latency"})
+    except (AttributeError, TypeError) as error:
         raise ValueError(
             f"noise must be a RobotNoise or hold arguments of it, got {noise!r}: {error}"
         ) from error
 
 
 class NoisyMotion:
-    """Latency and slip of many robots' wheels, and their odometry."""
+    """Slip of many robots' wheels, and their odometry."""
 
     def __init__(
         self, noise: RobotNoise, robots: int, *, wheel_base: float, time_step: float
@@ -106,9 +106,6 @@ class NoisyMotion:
         self._noise = noise
         self._wheel_base = wheel_base
         self._time_step = time_step
-        self.has_odometry = noise.slip > 0.0 or noise.drift > 0.0
-        """True if odometry may differ from the true poses."""
-        self._commands = np.zeros((robots, noise.latency + 1, 2))
         self._kept = np.ones((robots, 2))
         self._scales = np.ones((robots, 2))
         self._poses = np.zeros((robots, 3))
@@ -117,7 +114,6 @@ class NoisyMotion:
 
     def begin(self, index: int, pose: Sequence[float], rng: np.random.Generator) -> None:
         """Start an episode of a robot at a pose [m, m, rad] that it knows."""
-        self._commands[index] = 0.0
         self._kept[index] = 1.0
         self._poses[index] = pose
         self.odometry[index] = *pose, 0.0, 0.0
@@ -131,19 +127,14 @@ class NoisyMotion:
         rngs: Sequence[np.random.Generator],
     ) -> NDArray[np.float64]:
         """Speeds of the wheels over the ground [m/s], ``[N, 2]``, from the commanded ones."""
-        self._commands[running, :-1] = self._commands[running, 1:]
-        self._commands[running, -1] = speeds[running]
-        due = self._commands[:, 0]
         if self._noise.slip == 0.0:
-            return due.copy()
+            return speeds.copy()
         for index in np.flatnonzero(running).tolist():
             self._kept[index] = 1.0 - 2.0 * self._noise.slip * rngs[index].random(2)
-        return due * self._kept
+        return speeds * self._kept
 
     def measure(self, motions: NDArray[np.float64], running: NDArray[np.bool_]) -> None:
         """Update the odometry after a time step to motions ``[N, 5]``."""
-        if not self.has_odometry:
-            return
         before, now = self._poses[running], motions[running, :3]
         turned = _wrapped(now[:, 2] - before[:, 2])
         driven = _arc(now[:, :2] - before[:, :2], before[:, 2], turned)

@@ -26,7 +26,7 @@ _EARLY: Final = 0.2
 """Share of its period by which a decision may come early, as scans are irregular."""
 _PLACE: Final = 0.5
 """Side of the squares that count as one place [m]."""
-_NOWHERE: Final = 25.0
+_NOWHERE: Final = 40.0
 """A robot that could have driven this far must have come to a new place [m]."""
 
 
@@ -115,6 +115,7 @@ class Controller:
         self._ticked = now
         order = self._choose(now)
         self._ordered = (0.0, 0.0) if order is None else order[:2]
+        self.pilot.give(now, *self._ordered)
         return order
 
     def _choose(self, now: float) -> Order | None:
@@ -137,7 +138,8 @@ class Controller:
             self.aim(None, "arrived")
             return self._choose(now)
         if self._lost > _NOWHERE:
-            self.aim(None, f"no progress: time for {_NOWHERE:g} m, and no new place")
+            reason = "stands still" if self.pilot.stands_still else "no progress"
+            self.aim(None, f"{reason}: time for {_NOWHERE:g} m, and no new place")
             return self._choose(now)
         try:
             order = self._drive(seen, felt, now)
@@ -145,27 +147,32 @@ class Controller:
         except Exception as error:
             self.aim(None, str(error) if isinstance(error, ValueError) else f"failed: {error!r}")
             return self._choose(now)
-        order = self._unless_blocked(order, seen, now)
-        if order.reason == "driving":
-            self._count(felt)
-        return order
+        self._count(felt)
+        return self._unless_blocked(order, seen, now)
 
     def _unless_blocked(self, order: Order, seen: Seen, now: float) -> Order:
-        """The order, or a stop if it comes too near to something before the next check."""
+        """The order, or its turn alone if it comes too near to something before the next check."""
         nearest, sign = (seen.behind, -1.0) if order.linear < 0.0 else (seen.ahead, 1.0)
+        # A filter keeps off all that is measured.
+        if self.pilot.has_filter and nearest > 0.0:
+            return order
         clearance = nearest - self.pilot.robot.radius
         fastest = max(sign * self._ordered[0], self._track.fastest(seen.time, sign), 0.0)
         covered = fastest * (max(now - seen.time, 0.0) + self.check_period)
         if clearance - covered > self.stop_distance:
             return order
-        return Order(0.0, 0.0, f"obstacle: {max(clearance, 0.0):.2f} m from the rim")
+        reason = f"obstacle: {max(clearance, 0.0):.2f} m from the rim"
+        return Order(0.0, order.angular, reason)
 
     def _drive(self, seen: Seen, felt: Felt, now: float) -> Order:
         """The command that holds, or a new one where it is due."""
         due = self._decided + (1.0 - _EARLY) * self.pilot.period
         if self._command is None or not self._decided <= now < due:
             taken = self._track.pose_at(seen.time)
-            self._command = self.pilot.decide(seen.scan, felt.pose, felt.speeds, scan_pose=taken)
+            age = max(now - felt.time, 0.0)
+            self._command = self.pilot.decide(
+                seen.scan, felt.pose, felt.speeds, scan_pose=taken, time=now, age=age
+            )
             self._decided = now
         return Order(*self.pilot.ramp(self._ordered, self._command[2:], self._passed), "driving")
 

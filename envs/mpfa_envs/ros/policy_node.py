@@ -31,6 +31,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "silent": "reject",
     "map_size": 40.0,
     "clearance": 0.0,
+    "latency": -1.0,
     "stop_distance": 0.05,
     "scan_timeout": 0.5,
     "odometry_timeout": 0.5,
@@ -63,6 +64,7 @@ class PolicyNode(Node):
             mount=tuple(value("mount")) if any(value("mount")) else None,
             unseen=value("unseen") or None,
             clearance=value("clearance") or None,
+            latency=None if value("latency") < 0.0 else value("latency"),
             **options,
         )
         rate = check_positive("rate", value("rate"))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_not_negative, check_positive
+from mpfa_envs.checks import check_count, check_not_negative, check_positive, check_share
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import Body, filter_actions
 from mpfa_envs.sensing.observation import Memory, observation_slices
@@ -49,6 +49,7 @@ class SafetyFilter:
         clearance: Clearance of the rim to be kept [m]; a third of it where the robot passes by
             what it is nearer to already.
         samples: Speeds of each wheel among which to find another action.
+        braking: Share of the wheels' acceleration with which they slow down at least.
 
     Raises:
         ValueError: If a number is out of its range, or the robot takes farther than it sees to
@@ -82,6 +83,7 @@ class SafetyFilter:
         action_repeat: int = 2,
         clearance: float = CLEARANCE,
         samples: int = 9,
+        braking: float = 1.0,
     ) -> None:
         self.robot = resolve_robot(robot)
         self._parts = observation_slices(sectors, memory=memory, history=history)
@@ -101,6 +103,8 @@ class SafetyFilter:
             check_not_negative("clearance", clearance),
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
+            check_positive("braking", check_share("braking", braking))
+            * self.robot.wheel_limits.acceleration,
         )
         if self.robot.can_stop and (reach := _reach(self._body)) > self._max_range:
             raise ValueError(
@@ -125,13 +129,32 @@ class SafetyFilter:
         Raises:
             ValueError: If the shapes do not fit, or there is NaN among them.
         """
+        seen = np.asarray(observation)
+        return self.among(seen[..., None, :] if seen.ndim else seen, action)
+
+    def among(
+        self, observations: NDArray[np.float32], action: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Filter actions of robots that may be in any of some states.
+
+        Args:
+            observations: Observations in each of the states, ``[..., S, O]``.
+            action: What the policy would do, ``[..., 2]``.
+
+        Returns:
+            The actions that may be carried out in all states, ``[..., 2]``, float32.
+
+        Raises:
+            ValueError: As when it is called.
+        """
         size = max(part.stop for part in self._parts.values())
-        seen = np.asarray(observation, dtype=np.float64)
+        seen = np.asarray(observations, dtype=np.float64)
         wanted = np.asarray(action, dtype=np.float32)
-        if seen.ndim == 0 or seen.shape[-1] != size:
-            raise ValueError(f"observation must have shape [..., {size}], got {seen.shape}")
-        if wanted.shape != (*seen.shape[:-1], 2):
-            raise ValueError(f"action must have shape {(*seen.shape[:-1], 2)}, got {wanted.shape}")
+        if seen.ndim < 2 or seen.shape[-1] != size:
+            shape = seen.shape[:-2] + seen.shape[-1:]
+            raise ValueError(f"observation must have shape [..., {size}], got {shape}")
+        if wanted.shape != (*seen.shape[:-2], 2):
+            raise ValueError(f"action must have shape {(*seen.shape[:-2], 2)}, got {wanted.shape}")
         if np.isnan(seen).any() or np.isnan(wanted).any():
             raise ValueError("observation and action must not hold NaN")
         rows = seen.reshape(-1, size)
@@ -139,9 +162,9 @@ class SafetyFilter:
         chosen = np.empty_like(actions)
         filter_actions(
             actions,
-            self._ranges(rows),
+            self._ranges(rows).reshape(len(actions), -1, self._directions.shape[1]),
             self._directions,
-            self._wheel_speeds(rows),
+            self._wheel_speeds(rows).reshape(len(actions), -1, 2),
             self._candidates,
             self._body,
             chosen,
@@ -182,7 +205,7 @@ def _unseen(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 def _reach(body: Body) -> float:
     """Distance of the farthest point that a robot may come to before it stands [m]."""
     fastest = max(abs(body.limits.slow), abs(body.limits.fast))
-    time = body.repeat * body.time_step + 0.5 * fastest / body.limits.acceleration
+    time = body.repeat * body.time_step + 0.5 * fastest / body.braking
     return fastest * time + body.radius + body.clearance
 
 

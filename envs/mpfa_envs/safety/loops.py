@@ -28,6 +28,8 @@ class Body(NamedTuple):
     """For which wheel speeds are held [s]."""
     repeat: int
     """Time steps from decision to decision."""
+    braking: float
+    """How fast a wheel slows down [m/s²], which may be less than how fast it speeds up."""
 
 
 _PARTS = 2
@@ -39,6 +41,8 @@ _LEAST = 1 / 3
 _TURNS = 0.1
 """Weight of another turn relative to that of another forward speed. The robot steers clear rather
 than stopping: with equal weights it stands before walls."""
+_GAIN = 0.001
+"""Clearance that a robot gains at least that is ordered away from what is too near [m]."""
 _TOUCH = 1e-9
 """Rounding of distances [m]."""
 
@@ -46,9 +50,11 @@ _TOUCH = 1e-9
 @njit
 def filter_actions(
     actions: NDArray[np.float64],  # wanted, in [-1, 1], [N, 2]
-    ranges: NDArray[np.float64],  # of the rays, [N, R] [m]; infinite where they hit nothing
+    # Of the rays, in each of the states that a robot may be in [m], [N, S, R]; infinite where they
+    # hit nothing.
+    ranges: NDArray[np.float64],
     directions: NDArray[np.float64],  # of the rays, cosine and sine, [2, R]
-    speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2]
+    speeds: NDArray[np.float64],  # of the wheels in each state [m/s], [N, S, 2]
     candidates: NDArray[np.float64],  # actions to choose among, [K, 2]; the last one is safe
     body: Body,
     chosen: NDArray[np.float64],  # [N, 2]
@@ -58,28 +64,44 @@ def filter_actions(
     scale_actions(candidates, body.limits, commands)
     wanted = np.empty_like(actions)
     scale_actions(actions, body.limits, wanted)
-    points = np.empty((ranges.shape[1], 3))
+    states = ranges.shape[1]
+    points, counts = np.empty((states, ranges.shape[2], 3)), np.empty(states, np.int64)
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         chosen[robot] = actions[robot]
-        count = _near_points(ranges[robot], directions, speeds[robot], body, points)
-        if count == 0 or _is_admissible(wanted[robot], speeds[robot], points[:count], body):
+        for state in range(states):
+            counts[state] = _near_points(
+                ranges[robot, state], directions, speeds[robot, state], body, points[state]
+            )
+        # Real wheels creep while they are told to stand: what has come too near is left.
+        nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
+        wants = -1.0
+        if nearest - body.radius < _LEAST * body.clearance - _GAIN:
+            wants = nearest + _GAIN
+        room = _room_after(wanted[robot], speeds[robot], points, counts, body)
+        if room > wants:
             continue
+        admissible = room > -1.0
         gaps = np.empty(last)
         for k in range(last):
             across, along = candidates[k] - actions[robot]
             gaps[k] = (across + along) ** 2 + _TURNS * (across - along) ** 2
-        chosen[robot] = candidates[last]
-        if body.limits.slow > 0.0:
+        if not admissible:
+            chosen[robot] = candidates[last]
+        if not admissible and body.limits.slow > 0.0:
             # Sectors show less than the truth: the circle that was free before may seem to be
             # blocked now, and the freer one is the better guess.
             around = _turning_radius(body.limits, body.wheel_base)
-            to_left = _nearest(0.0, around, points[:count])
-            side = 1.0 if to_left >= _nearest(0.0, -around, points[:count]) else -1.0
+            near = points[0, : counts[0]]
+            to_left = _nearest(0.0, around, near, 0.0)
+            side = 1.0 if to_left >= _nearest(0.0, -around, near, 0.0) else -1.0
             chosen[robot, 0], chosen[robot, 1] = -side, side
         for k in np.argsort(gaps):
-            if _is_admissible(commands[k], speeds[robot], points[:count], body):
+            room = _room_after(commands[k], speeds[robot], points, counts, body)
+            if room > wants or (not admissible and room > -1.0):
                 chosen[robot] = candidates[k]
+                admissible = True
+            if room > wants:
                 break
 
 
@@ -97,7 +119,7 @@ def _near_points(
     if body.limits.slow > 0.0:
         reach += 2.0 * _turning_radius(body.limits, body.wheel_base)
     else:
-        reach += 0.5 * fastest * fastest / body.limits.acceleration
+        reach += 0.5 * fastest * fastest / body.braking
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
@@ -115,24 +137,40 @@ def _near_points(
 
 
 @njit
-def _is_admissible(
+def _room_after(
+    command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
+    speeds: NDArray[np.float64],  # in each state [m/s], [S, 2]
+    points: NDArray[np.float64],  # [S, R, 3]
+    counts: NDArray[np.int64],  # of the points, [S]
+    body: Body,
+) -> float:
+    """Least distance of a point once the robot stands [m]; -1 if the command is not admissible."""
+    least = math.inf
+    for state in range(counts.shape[0]):
+        if counts[state] > 0:
+            room = _room_after_from(command, speeds[state], points[state, : counts[state]], body)
+            least = min(least, room)
+    return least
+
+
+@njit
+def _room_after_from(
     command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
     speeds: NDArray[np.float64],  # now [m/s], [2]
     points: NDArray[np.float64],  # [P, 3]
     body: Body,
-) -> bool:
-    """Return True if the robot stays off the points while it does this, and can do so afterwards.
+) -> float:
+    """As above, in one state: the robot stays off the points, and can do so afterwards.
 
     It can if it stands still in time or, where it cannot stand still, if a full circle is free.
     """
-    change = body.limits.acceleration * body.time_step
     left, right = speeds[0], speeds[1]
     x, y, heading = 0.0, 0.0, 0.0
     step = 0
     while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
         to_left, to_right = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
-        left = min(max(to_left, left - change), left + change)
-        right = min(max(to_right, right - change), right + change)
+        left = _changed(left, to_left, body)
+        right = _changed(right, to_right, body)
         part = body.time_step / _PARTS
         turn = (right - left) / body.wheel_base * part
         along = 0.5 * (left + right) * part
@@ -143,26 +181,34 @@ def _is_admissible(
             for point in range(points.shape[0]):
                 across, ahead = points[point, 1] - y, points[point, 0] - x
                 if across * across + ahead * ahead < points[point, 2]:
-                    return False
+                    return -1.0
         step += 1
     if body.limits.slow <= 0.0:
-        return True
+        return _nearest(x, y, points, body.radius)
     radius = _turning_radius(body.limits, body.wheel_base)
     kept = radius + body.radius + body.clearance
     across, along = radius * math.sin(heading), radius * math.cos(heading)
-    return (
-        _nearest(x - across, y + along, points) >= kept
-        or _nearest(x + across, y - along, points) >= kept
-    )
+    to_left = _nearest(x - across, y + along, points, 0.0)
+    free = max(to_left, _nearest(x + across, y - along, points, 0.0))
+    return free if free >= kept else -1.0
 
 
 @njit
-def _nearest(x: float, y: float, points: NDArray[np.float64]) -> float:
-    """Distance of the nearest point from a place (x, y) [m]."""
+def _changed(speed: float, wanted: float, body: Body) -> float:
+    """The speed of a wheel after a time step [m/s]."""
+    slows_down = abs(wanted) < abs(speed) or wanted * speed < 0.0
+    change = (body.braking if slows_down else body.limits.acceleration) * body.time_step
+    return min(max(wanted, speed - change), speed + change)
+
+
+@njit
+def _nearest(x: float, y: float, points: NDArray[np.float64], least: float) -> float:
+    """Distance of a place (x, y) from the nearest point, of those to be kept off by least [m]."""
     nearest = math.inf
     for point in range(points.shape[0]):
         across, ahead = points[point, 1] - y, points[point, 0] - x
-        nearest = min(nearest, across * across + ahead * ahead)
+        if points[point, 2] >= least * least:
+            nearest = min(nearest, across * across + ahead * ahead)
     return math.sqrt(nearest)
 
 

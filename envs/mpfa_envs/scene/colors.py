@@ -82,6 +82,7 @@ OUTCOMES: Final[dict[str, Color]] = {
     "success": (*BLUE, 190),
     "collision": (*VERMILION, 235),
     "timeout": (*PURPLE, 235),
+    "standstill": (*ORANGE, 235),
 }
 """Colors of paths by the end of their episode."""
 

@@ -56,6 +56,7 @@ class MapArrays(NamedTuple):
 @njit
 def remember(
     motions: NDArray[np.float64],  # x, y, heading first [m, m, rad], [N, 5]
+    taken: NDArray[np.float64],  # where the scans were taken, as motions
     goals: NDArray[np.float64],  # x, y [m], [N, 2]
     ranges: NDArray[np.float64],  # [m], [N, rays]
     chosen: NDArray[np.bool_],  # [N]; the others' rows stay
@@ -74,11 +75,10 @@ def remember(
             continue
         nx, ny = maps.shapes[robot, 0], maps.shapes[robot, 1]
         levels, costs = maps.levels[robot, :nx, :ny], maps.costs[robot, :nx, :ny]
-        x, y, heading = motions[robot, 0], motions[robot, 1], motions[robot, 2]
-        cosine, sine = math.cos(heading), math.sin(heading)
         # In cells from the center of the first.
-        u = (x - maps.origins[robot, 0]) / resolution
-        v = (y - maps.origins[robot, 1]) / resolution
+        u = (taken[robot, 0] - maps.origins[robot, 0]) / resolution
+        v = (taken[robot, 1] - maps.origins[robot, 1]) / resolution
+        cosine, sine = math.cos(taken[robot, 2]), math.sin(taken[robot, 2])
         changed = False
         for ray in range(ranges.shape[1]):
             if ranges[robot, ray] < max_range:
@@ -86,6 +86,10 @@ def remember(
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
                 changed |= _enter(levels, u + reach * across, v + reach * up, bounds)
+        x, y, heading = motions[robot, 0], motions[robot, 1], motions[robot, 2]
+        cosine, sine = math.cos(heading), math.sin(heading)
+        u = (x - maps.origins[robot, 0]) / resolution
+        v = (y - maps.origins[robot, 1]) / resolution
         i, j = cell_of(u, nx), cell_of(v, ny)
         if costs[i, j] == UNKNOWN or (changed and not _costs_the_same(levels, costs, i, j)):
             goal = (
@@ -280,7 +284,8 @@ def _look_ahead(
 @njit
 def _is_open(levels: NDArray[np.uint8], i: int, j: int, to_i: int, to_j: int) -> bool:
     """Return True if the line between two cells is no narrower than its ends."""
-    widest = max(levels[i, j], levels[to_i, to_j])
+    # From a blocked cell every line would be open, through walls too.
+    widest = min(max(levels[i, j], levels[to_i, to_j]), TIGHT)
     steps = max(abs(to_i - i), abs(to_j - j))
     for step in range(1, steps):
         at_i = math.floor(i + (to_i - i) * step / steps + 0.5)

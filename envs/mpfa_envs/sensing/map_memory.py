@@ -107,6 +107,7 @@ class MapMemory:
         chosen: NDArray[np.bool_] | None = None,
         *,
         directions: NDArray[np.float64] | None = None,
+        taken: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Enter a scan in the maps and find the paths.
 
@@ -117,6 +118,7 @@ class MapMemory:
             chosen: Which robots have looked around, ``[N]``; None: all. The others' paths stay.
             directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``;
                 None: those of the lidar.
+            taken: Poses where the scans were taken, as motions; None: the same.
 
         Returns:
             Direction (x, y) in the robot's frame and length [m] of the path, ``[N, 3]``; the length
@@ -125,8 +127,9 @@ class MapMemory:
         if chosen is None:
             chosen = np.ones(len(motions), dtype=np.bool_)
         directions = self._directions if directions is None else directions
-        lengths = self._lengths
-        remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._paths)
+        taken = motions if taken is None else taken
+        scans = goals, ranges, chosen, directions
+        remember(motions, taken, *scans, self.arrays, self._lengths, self._paths)
         return self._paths
 
     def sketch(self, index: int, x: float, y: float) -> Sketch:

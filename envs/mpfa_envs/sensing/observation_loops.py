@@ -108,3 +108,52 @@ def _sector_range(rays: NDArray[np.float64], first: int, count: int, median: boo
     for ray in range(first + 1, first + count):
         nearest = min(nearest, rays[ray])
     return nearest
+
+
+@njit
+def look_from(
+    pose: NDArray[np.float64],  # x, y, heading first [m, m, rad], [3]
+    angles: NDArray[np.float64],  # of the rays in the robot's frame [rad], [P]
+    ranges: NDArray[np.float64],  # [m], [P]
+    taken: NDArray[np.float64],  # pose where they were measured, [3]
+    max_range: float,  # of a ray that has met nothing [m]
+    view: float,  # [rad]
+    seen: NDArray[np.float64],  # [m], [R]
+) -> None:
+    """Write the ranges, left to right, of a scan as it is from another pose.
+
+    Where no ray points any more the nearer of the two beside it counts.
+    """
+    rays, around = seen.shape[0], view > math.tau - 1e-9
+    seen[:] = math.inf
+    away_x, away_y = taken[0] - pose[0], taken[1] - pose[1]
+    for ray in range(angles.shape[0]):
+        angle, distance = angles[ray] + taken[2], ranges[ray]
+        if distance < max_range:
+            x = away_x + distance * math.cos(angle)
+            y = away_y + distance * math.sin(angle)
+            angle, distance = math.atan2(y, x), math.hypot(x, y)
+        angle -= pose[2]
+        angle -= math.tau * round(angle / math.tau)
+        place = math.floor((0.5 - angle / view) * rays)
+        if around:
+            place %= rays
+        if 0 <= place < rays:
+            seen[place] = min(seen[place], distance, max_range)
+    filled = seen.copy()
+    for ray in range(rays):
+        if seen[ray] < math.inf:
+            continue
+        for step in (-1, 1):
+            place = ray + step
+            for _ in range(rays):
+                if around:
+                    place %= rays
+                if place < 0 or place >= rays:
+                    break
+                if seen[place] < math.inf:
+                    filled[ray] = min(filled[ray], seen[place])
+                    break
+                place += step
+        filled[ray] = min(filled[ray], max_range)
+    seen[:] = filled

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, cast, get_args
 from mpfa_envs.checks import check_count, did_you_mean
 from mpfa_envs.generators.generate import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.barn import barn_task, barn_worlds, load_barn
 from mpfa_envs.worlds.task import Task
@@ -20,11 +20,6 @@ TASKS_PER_WORLD: Final = 4
 """Number of tasks in each world of a generator."""
 _STANDARD_TIME_STEP: Final = 0.1
 """Unit of time limits [s]."""
-GENERATED_MAX_STEPS: Final = 1500
-"""Time limit of a TurtleBot2 in the worlds of a generator, of which some have paths of 40 m.
-
-A slower robot has longer in proportion.
-"""
 BARN_MAX_STEPS: Final = 1000
 """The benchmark's 100 s."""
 _IN_A_WORLD: Final = 200
@@ -51,8 +46,8 @@ class WorldTask(NamedTuple):
 
         Examples:
             >>> from mpfa_envs import world_tasks
-            >>> world_tasks("bars:test", episodes=1)[0].limit({"time_step": 0.05})  # 150 s
-            {'max_steps': 3000}
+            >>> world_tasks("barn", episodes=1)[0].limit({"time_step": 0.05})  # 100 s
+            {'max_steps': 2000}
         """
         if self.max_steps is None:
             return {}
@@ -80,8 +75,7 @@ def world_tasks(
             each world of the benchmark. The first tasks of a longer list are those of a shorter
             one.
         seed: Seed of the tasks in a world; those of a generator are fixed.
-        robot: Whose radius counts in a world. Those of a generator are for a TurtleBot2, and a
-            slower robot has more time for them.
+        robot: Whose radius counts in a world. Those of a generator are for a TurtleBot2.
 
     Returns:
         The tasks with their worlds.
@@ -125,9 +119,7 @@ def world_tasks(
             worlds=-(-count // TASKS_PER_WORLD),
             tasks=TASKS_PER_WORLD,
         )
-        speeds = [resolve_robot(each).max_wheel_speed for each in ("turtlebot2", robot)]
-        limit = round(GENERATED_MAX_STEPS * max(1.0, speeds[0] / speeds[1]))
-        return _numbered([WorldTask(*each, limit) for each in made[:count]])
+        return _numbered([WorldTask(*each) for each in made[:count]])
     world = resolve_world(name)
     count = _IN_A_WORLD if episodes is None else episodes
     pairs = evaluation_pairs(world, count, seed, robot=robot)

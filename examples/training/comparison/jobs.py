@@ -155,6 +155,7 @@ class Job:
             # A comparison drives the pairs of the first seed, and its robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None
+            and found.get("latency") is None
             and found.get("robot") is None
             and policy.exists()
             and found.get("sha256") == files.digest(policy)

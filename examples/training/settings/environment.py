@@ -19,8 +19,6 @@ class NoiseSettings:
     """Chance that a ray reports the greatest range."""
     slip: float = 0.0
     """Mean share of its path that a wheel loses, up to 0.45."""
-    latency: int = 0
-    """Time steps of 0.1 s after which an action reaches the wheels."""
     drift: float = 0.0
     """Standard deviation of the share of the error of odometry in distances, and in turns."""
 
@@ -35,8 +33,9 @@ class EnvironmentSettings:
     your own (``docs/howto/robot.md``), whose values a run keeps in its place."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
-    max_steps: int = 500
-    """Time limit of an episode [0.1 s]."""
+    max_steps: int | None = None
+    """Time limit of an episode [0.1 s]; null: the time in which the robot drives 105 m at full
+    speed, as in evaluations."""
     action_repeat: int | None = 2
     """Time steps of 0.1 s for which an action is held. DDPG is less reliable with one
     (``docs/tuning.md``). Null: the time in which the robot drives 0.14 m at full speed, at least
@@ -66,6 +65,9 @@ class EnvironmentSettings:
     """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
+    latency: Any = None
+    """Time from a scan to the moment at which the wheels take the order [s], or the least and the
+    greatest, ``[0.0,0.2]``, between which each episode has its own; null: the robot's."""
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off obstacles
     (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1

@@ -286,7 +286,11 @@ SAME = "same"
 HARDEST = {"mixed": "mazes"}
 """Worlds in which policies that do well in a mixture of worlds still differ."""
 REGIMES: dict[str, dict[str, Any]] = {
-    "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
+    "paper": {
+        "regime": "paper",
+        "defaults": [{"override /curriculum": "paper"}],
+        "environment": {"max_steps": 500},
+    },
     "rooms": {
         "regime": "rooms",
         "defaults": [{"override /curriculum": "rooms"}],
@@ -401,6 +405,13 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     OmegaConf.set_struct(values, False)
     for name in ("defaults", "hydra"):
         values.pop(name, None)
+    noise = OmegaConf.select(values, "environment.noise") if isinstance(config, dict) else None
+    # Runs of earlier versions have it, in time steps.
+    if late := (noise or {}).pop("latency", 0):
+        raise ValueError(
+            f"environment.noise.latency must be 0, got {late}: train a policy with "
+            "environment.latency, in seconds, in its place"
+        )
     structure = OmegaConf.structured(TrainSettings)
     if "method" in values:
         # Each method has settings of its own: its name says which.

@@ -113,7 +113,7 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     seen = training.reset()["observation"].numpy()[0]
     task = training.env.tasks[0]
     assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
-    for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):
+    for name in ("action_repeat", "closeness_distance", "physics"):
         assert getattr(judging.config, name) == getattr(training.env.config, name)
     assert judging.config.closeness_distance == pytest.approx(0.28)
     training.close()
@@ -172,14 +172,17 @@ def test_the_ids_are_the_tasks_that_the_regimes_learn(
 
 def test_the_settings_of_noise_are_those_of_the_environment() -> None:
     assert asdict(NoiseSettings()) == asdict(RobotNoise())
-    settings = EnvironmentSettings(physics="kinematic", noise=NoiseSettings(slip=0.1, latency=2))
+    settings = EnvironmentSettings(
+        physics="kinematic", noise=NoiseSettings(slip=0.1), latency=[0.0, 0.2]
+    )
     env = make_training_env("A", settings, robots=2)
-    assert vector_of(env).config.noise == RobotNoise(slip=0.1, latency=2)
+    assert vector_of(env).config.noise == RobotNoise(slip=0.1)
+    assert vector_of(env).config.latency == (0.0, 0.2)
     env.close()
 
 
 def test_noise_on_the_command_line_is_read_or_rejected() -> None:
-    assert read_noise("slip=0.1,latency=2") == RobotNoise(slip=0.1, latency=2)
+    assert read_noise("slip=0.1,drift=0.2") == RobotNoise(slip=0.1, drift=0.2)
     for words in ("slip=2", "slip", "latency=0.5", "wind=1"):
         with pytest.raises(ArgumentTypeError):
             read_noise(words)

@@ -1,0 +1,42 @@
+"""The speed of a robot that drives the arcs of another one, with which a policy has learned."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from mpfa_envs.robots.model import RobotModel
+
+_BEYOND: Final = 0.02
+"""Share of its speed range by which a wheel's command may exceed it."""
+
+
+def widening(robot: RobotModel, learned: RobotModel) -> float:
+    """Ratio of wheel speed differences to another robot's on the same arc, at least 1."""
+    return max(1.0, robot.wheel_base / learned.wheel_base)
+
+
+def wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
+    """Least and greatest speed of its wheels on the arcs of another robot, at its pace [m/s]."""
+    middle = 0.5 * (learned.max_wheel_speed + learned.min_wheel_speed)
+    span = 0.5 * (learned.max_wheel_speed - learned.min_wheel_speed)
+    span *= widening(robot, learned)
+    return middle - span, middle + span
+
+
+def tolerance(robot: RobotModel) -> float:
+    """Excess of commanded wheel speeds over their range [m/s]."""
+    return _BEYOND * (robot.max_wheel_speed - robot.min_wheel_speed)
+
+
+def fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
+    """The greatest share of the other robot's speed with which it can drive the same arcs."""
+    wheels = (robot.max_wheel_speed + tolerance(robot)) / wheel_range(robot, learned)[1]
+    pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
+    if robot.turn_limit is not None:
+        pace = min(pace, robot.turn_limit / learned.max_angular_speed)
+    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
+        needed = learned.wheel_acceleration * widening(robot, learned)
+        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
+    return pace
