@@ -63,7 +63,7 @@ def short_name(name: str, most: int = 240) -> str:
 
     Examples:
         >>> short_name("method.batch_size=8,robots=1", 20)
-        'method.batc-adfb1bb8'
+        'method.batc-3d8e7658'
     """
     whole = name.encode()
     if len(whole) <= most:

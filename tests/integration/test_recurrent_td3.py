@@ -117,8 +117,9 @@ def test_every_robot_of_an_evaluation_remembers_its_own_episode() -> None:
     first = driving.drive(env, np.arange(3), seen)
     driving.begin(env, 1)
     again = driving.drive(env, np.array([1, 2]), seen[1:])
-    np.testing.assert_array_equal(again[0], first[1])
-    assert not np.array_equal(again[1], first[2])
+    # Products of two rows and of three round differently on some processors.
+    np.testing.assert_allclose(again[0], first[1], rtol=0, atol=1e-7)
+    assert abs(again[1] - first[2]).max() > 1e-5
     env.close()
 
 
