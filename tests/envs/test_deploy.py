@@ -187,6 +187,8 @@ def a_pilot(action: tuple[float, float], **options: Any) -> Pilot:
         ({"wheel_acceleration": 0.05}, 0.25),
         ({"wheel_acceleration": 4.0}, 1.0),
         ({"wheel_acceleration": None}, 1.0),
+        ({"deceleration": 0.2}, 0.5),
+        ({"turn_acceleration": 1.0}, 1.0),  # The policy's wheels turn it as fast as they can.
         ({"turn_limit": 1.0}, 1.0 / math.pi),
         ({"max_wheel_speed": 0.35, "min_wheel_speed": -0.35}, 0.5),
         ({"radius": 0.19, "wheel_base": 0.345, "wheel_acceleration": 0.3}, 0.5),
@@ -215,6 +217,8 @@ def wall_at(distance: float) -> Scan:
         KOBUKI,
         replace(KOBUKI, name="slow", wheel_acceleration=0.2),
         replace(KOBUKI, name="quick", wheel_acceleration=None),
+        replace(KOBUKI, name="brakes", deceleration=0.4),
+        replace(KOBUKI, name="turns", turn_acceleration=1.0),
         replace(KOBUKI, name="wider", radius=0.19, wheel_base=0.3),
         ROBOTS["turtlebot4"],
         ROBOTS["burger"],
@@ -273,6 +277,22 @@ def test_it_does_not_drive_where_the_scan_does_not_look(
         linear, angular = 0.35 * sum(action), 0.7 * (action[1] - action[0]) / 0.23
         wanted = (linear if drives else 0.0, angular)
         assert command[2:] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("clearance", [None, 0.03])
+def test_a_body_that_does_not_reverse_turns_on_the_spot(clearance: float | None) -> None:
+    forwards = replace(KOBUKI, reverse=False)
+    pilot = a_pilot((-0.7, -0.5), robot=forwards, clearance=clearance)
+    command = pilot.decide(wall_at(3.0), (0.0, 0.0, 0.0), (0.0, 0.0))
+    assert command[2:] == pytest.approx((0.0, 0.7 * 0.2 / 0.23))
+
+
+def test_wheels_that_do_not_turn_backwards_stand_where_the_scan_does_not_look() -> None:
+    robot = replace(KOBUKI, min_wheel_speed=0.0)
+    made = Pilot(card(**ALL_ROUND | {"robot": robot}), lambda _: np.array([(0.5, 0.2)]), unseen=0.3)
+    made.begin((4.0, 0.0))
+    scan = Scan(-0.5, math.pi / 180, np.full(57, 3.0))
+    assert made.decide(scan, (0.0, 0.0, 0.0), (0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_a_robot_that_cannot_stop_has_no_filter() -> None:

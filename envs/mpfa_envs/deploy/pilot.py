@@ -13,6 +13,7 @@ from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
 from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
@@ -298,8 +299,12 @@ class Pilot:
         learned = self.card.robot
         left, right = learned.wheel_speeds(action)
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
-        if (np.abs(towards) < _TOWARDS).any():
-            left, right = 0.5 * (left - right), 0.5 * (right - left)
+        backwards = left + right < 0.0 and not self.robot.reverse
+        if backwards or (np.abs(towards) < _TOWARDS).any():
+            # Wheels that do not turn backwards cannot turn the robot on the spot: it stands.
+            most = max(min(learned.max_wheel_speed, -learned.min_wheel_speed), 0.0)
+            right = min(max(0.5 * (right - left), -most), most)
+            left = -right
         if self._keep is not None:
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             observation[: self.card.sectors][hidden] = 1.0
@@ -324,17 +329,12 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        known = self.card.robot.wheel_limits.acceleration * self.pace**2
-        if math.isinf(known):
+        limits = self.card.robot.wheel_limits
+        if math.isinf(min(limits.acceleration, limits.turning)):
             return wanted
         half = 0.5 * self.card.robot.wheel_base
-        left, right = (
-            min(max(to, now - known * passed), now + known * passed)
-            for now, to in (
-                (last[0] + side * half * last[1], wanted[0] + side * half * wanted[1])
-                for side in (-1.0, 1.0)
-            )
-        )
+        now, to = ((each[0] - half * each[1], each[0] + half * each[1]) for each in (last, wanted))
+        left, right = changed(now, to, limits, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half
 
     def _filter(self, clearance: float) -> SafetyFilter:
@@ -342,10 +342,13 @@ class Pilot:
         card, learned = self.card, self.card.robot
         braking = self.robot.wheel_limits.acceleration / _widening(self.robot, learned)
         braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
+        turning = min(_turning(learned), _turning(self.robot) / self.pace**2)
         body = replace(
             learned,
             radius=max(self.robot.radius, 0.5 * learned.wheel_base),
             wheel_acceleration=None if math.isinf(braking) else braking,
+            turn_acceleration=None if math.isinf(turning) else turning,
+            reverse=learned.reverse and self.robot.reverse,
         )
         repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
         rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
@@ -397,10 +400,19 @@ def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
     pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
     if robot.turn_limit is not None:
         pace = min(pace, robot.turn_limit / learned.max_angular_speed)
-    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
-        needed = learned.wheel_acceleration * _widening(robot, learned)
-        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
+    known = learned.wheel_limits.acceleration * _widening(robot, learned)
+    for can, does in (
+        (robot.wheel_limits.acceleration, known),
+        (_turning(robot), _turning(learned)),
+    ):
+        if math.isfinite(can) and math.isfinite(does):
+            pace = min(pace, math.sqrt(can / does))
     return pace
+
+
+def _turning(robot: RobotModel) -> float:
+    """Fastest change of its turn by the controller [rad/s²]."""
+    return math.inf if robot.turn_acceleration is None else robot.turn_acceleration
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:

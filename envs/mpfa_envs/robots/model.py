@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import MISSING, dataclass, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean
+from mpfa_envs.checks import check_choice, check_count, check_number, check_positive, did_you_mean
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ PAPER_CLEARANCE: Final = 0.17
 A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
 """
 
+_OPTIONAL: Final = ("wheel_acceleration", "deceleration", "turn_limit", "turn_acceleration")
+"""Numbers that may be None."""
 _LEVEL: Final = math.radians(10.0)
 """Greatest roll of a lidar that counts as level [rad]."""
 
@@ -43,8 +45,14 @@ class RobotModel:
         min_wheel_speed: Slowest speed of a wheel over the ground [m/s].
         max_wheel_speed: Fastest speed of a wheel over the ground [m/s].
         wheel_acceleration: How fast the speed of a wheel changes [m/s²]; None: at once.
+        deceleration: How fast the robot brakes, where that is slower [m/s²]: the smaller one of
+            both holds for driving off and braking alike; None: as it accelerates.
         turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
             as they can. Both wheels then change by the same, so that the forward speed stays.
+        turn_acceleration: How fast its turn changes, where its wheels could change it faster
+            [rad/s²]; None: as they can.
+        reverse: False if its controller does not let the body drive backwards; its wheels still
+            turn it on the spot.
         field_of_view: Angle that its lidar sees, which its front halves [deg]. The default does not
             fit a robot that reverses: filter, dynamic window and pilot keep it from driving where
             it does not see. Give 360.
@@ -78,7 +86,10 @@ class RobotModel:
     min_wheel_speed: float
     max_wheel_speed: float
     wheel_acceleration: float | None = None
+    deceleration: float | None = None
     turn_limit: float | None = None
+    turn_acceleration: float | None = None
+    reverse: bool = True
     field_of_view: float = 180.0
     lidar_rays: int | None = None
     lidar_range: float = 10.0
@@ -88,13 +99,14 @@ class RobotModel:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
         object.__setattr__(self, "lidar_mount", check_mount("lidar_mount", self.lidar_mount))
+        check_choice("reverse", self.reverse, Literal[True, False])
         if self.lidar_rays is not None:
             check_count("lidar_rays", self.lidar_rays)
         for field in fields(self)[1:]:
             value = getattr(self, field.name)
-            if field.name in ("lidar_rays", "lidar_mount"):
+            if field.name in ("lidar_rays", "lidar_mount", "reverse"):
                 continue
-            if value is None and field.name in ("wheel_acceleration", "turn_limit"):
+            if value is None and field.name in _OPTIONAL:
                 continue
             if not isinstance(value, (int, float)):
                 raise ValueError(f"{field.name} must be a finite number, got {value!r}")
@@ -153,9 +165,13 @@ class RobotModel:
     @property
     def wheel_limits(self) -> WheelLimits:
         """Limits of the wheels, as compiled loops read them."""
-        change = math.inf if self.wheel_acceleration is None else self.wheel_acceleration
-        across = math.inf if self.turn_limit is None else 0.5 * self.turn_limit * self.wheel_base
-        return WheelLimits(self.min_wheel_speed, self.max_wheel_speed, across, change)
+        change = min(each or math.inf for each in (self.wheel_acceleration, self.deceleration))
+        across, turning = (
+            math.inf if each is None else 0.5 * each * self.wheel_base
+            for each in (self.turn_limit, self.turn_acceleration)
+        )
+        slow, fast = self.min_wheel_speed, self.max_wheel_speed
+        return WheelLimits(slow, fast, across, change, turning, self.reverse)
 
     def wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
         """Read an action.

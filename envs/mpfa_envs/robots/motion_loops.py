@@ -23,6 +23,10 @@ class WheelLimits(NamedTuple):
     """Greatest difference of a wheel's speed from the mean of both [m/s]."""
     acceleration: float
     """Acceleration of a wheel [m/s²]."""
+    turning: float = math.inf
+    """By how much that difference changes at most [m/s²]."""
+    reverse: bool = True
+    """False if the mean of both is never below 0."""
 
 
 _ROUNDING = 1e-12
@@ -42,6 +46,10 @@ def limited(left: float, right: float, limits: WheelLimits) -> tuple[float, floa
     slow, fast = limits.slow - _ROUNDING, limits.fast + _ROUNDING
     left = left if slow <= left <= fast else min(max(left, limits.slow), limits.fast)
     right = right if slow <= right <= fast else min(max(right, limits.slow), limits.fast)
+    if left + right < 0.0 and not limits.reverse:
+        across = min(max(0.5 * (right - left), limits.slow), -limits.slow)
+        across = min(max(across, -limits.fast), limits.fast)
+        left, right = -across, across
     return left, right
 
 
@@ -63,6 +71,24 @@ def scale_actions(
 
 
 @njit
+def changed(
+    now: tuple[float, float], wanted: tuple[float, float], limits: WheelLimits, time: float
+) -> tuple[float, float]:
+    """The speeds nearest to the wanted ones that the wheels can have after a time [m/s, s]."""
+    (left, right), (to_left, to_right) = now, wanted
+    change, most = limits.acceleration * time, limits.turning * time
+    across = 0.5 * ((to_right - right) - (to_left - left))
+    if abs(across) > most:
+        forward = 0.5 * ((to_right - right) + (to_left - left))
+        across = math.copysign(most, across)
+        to_left, to_right = left + forward - across, right + forward + across
+    return (
+        min(max(to_left, left - change), left + change),
+        min(max(to_right, right - change), right + change),
+    )
+
+
+@njit
 def accelerate(
     speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2], changed in place
     wanted: NDArray[np.float64],  # [m/s], [N, 2]
@@ -71,12 +97,11 @@ def accelerate(
     time_step: float,  # [s]
 ) -> None:
     """Bring the speeds of the wheels as near to the wanted ones as one time step allows."""
-    change = limits.acceleration * time_step
     for robot in range(speeds.shape[0]):
         if running[robot]:
-            left, right = limited(wanted[robot, 0], wanted[robot, 1], limits)
-            speeds[robot, 0] = min(max(left, speeds[robot, 0] - change), speeds[robot, 0] + change)
-            speeds[robot, 1] = min(max(right, speeds[robot, 1] - change), speeds[robot, 1] + change)
+            to = limited(wanted[robot, 0], wanted[robot, 1], limits)
+            now = speeds[robot, 0], speeds[robot, 1]
+            speeds[robot, 0], speeds[robot, 1] = changed(now, to, limits, time_step)
 
 
 @njit

@@ -18,7 +18,9 @@ _UNITS: Final = {
     "min_wheel_speed": "m/s",
     "max_wheel_speed": "m/s",
     "wheel_acceleration": "m/s²",
+    "deceleration": "m/s²",
     "turn_limit": "rad/s",
+    "turn_acceleration": "rad/s²",
     "field_of_view": "deg",
 }
 """Units of the numbers that are not in meters."""
@@ -72,6 +74,10 @@ class _Reader(NodeReader):
         """Read the value of a key."""
         if key == "name":
             return self.text(node, key)
+        if key == "reverse":
+            if (word := self.text(node, key).lower()) not in ("true", "false"):
+                raise self.error(node, f"{key} must be true or false, got {word!r}")
+            return word == "true"
         if key == "lidar_mount":
             return [self.number(each, key, "") for each in self.items(node, key)]
         value = self.number(node, key, "" if key == "lidar_rays" else f" in {self._unit(key)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mpfa_envs.compiled import njit
-from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
+from mpfa_envs.robots.motion_loops import WheelLimits, changed, scale_actions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -125,14 +125,12 @@ def _is_admissible(
 
     It can if it stands still in time or, where it cannot stand still, if a full circle is free.
     """
-    change = body.limits.acceleration * body.time_step
     left, right = speeds[0], speeds[1]
     x, y, heading = 0.0, 0.0, 0.0
     step = 0
     while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
-        to_left, to_right = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
-        left = min(max(to_left, left - change), left + change)
-        right = min(max(to_right, right - change), right + change)
+        wanted = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
+        left, right = changed((left, right), wanted, body.limits, body.time_step)
         part = body.time_step / _PARTS
         turn = (right - left) / body.wheel_base * part
         along = 0.5 * (left + right) * part
