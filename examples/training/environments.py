@@ -59,7 +59,7 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         **seen,
         # The lidar saturates where the training ends an episode, and shows all distances above; a
         # robot that can stop may drive on from there, and must know how near it is.
-        "closeness_distance": robot.radius + (0.0 if robot.can_stop else settings.clearance),
+        "closeness_distance": robot.lidar_to_rim + (0.0 if robot.can_stop else settings.clearance),
     }
 
 

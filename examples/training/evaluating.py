@@ -88,7 +88,7 @@ def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
     robot, known = resolve_robot(robot), TaskConfig(**policy.env_arguments)
     moved = copy(policy)
     # The lidar saturates as far from the rim as it did.
-    near = known.closeness_distance - known.robot.radius + robot.radius
+    near = known.closeness_distance - known.robot.lidar_to_rim + robot.lidar_to_rim
     changes = {"robot": asdict(robot), "closeness_distance": round(near, 9)}
     moved.env_arguments = {**policy.env_arguments, **changes}
     parts = TaskConfig(**moved.env_arguments).observation_slices

@@ -15,7 +15,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import mpfa_envs
 from mpfa_envs import ROBOTS, NavigationEnv, RobotModel, TaskConfig
-from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
+from mpfa_envs.deploy import Card, CardError, Pilot, Scan, ScanError, read_exported
 from mpfa_envs.robots.drives import KinematicDrives
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.exported import card, exported
@@ -273,6 +273,10 @@ def test_it_does_not_drive_where_the_scan_does_not_look(
     scan = Scan(-math.radians(half), math.pi / 180, np.full(count, 3.0))
     for unseen in (10.0, 0.5):
         pilot = a_pilot(action, unseen=unseen, clearance=clearance)
+        if clearance and half < 90.0:
+            with pytest.raises(ScanError, match="up to 90 degrees from ahead for the filter"):
+                pilot.decide(scan, (0.0, 0.0, 0.0), (0.0, 0.0))
+            continue
         command = pilot.decide(scan, (0.0, 0.0, 0.0), (0.0, 0.0))
         linear, angular = 0.35 * sum(action), 0.7 * (action[1] - action[0]) / 0.23
         wanted = (linear if drives else 0.0, angular)

@@ -25,7 +25,8 @@ class MapPath:
         # Without Numba the loops would run, but a thousand times more slowly.
         import_module("numba")
         # The rays come with each scan, and of the room only the size is known.
-        lidar: Any = SimpleNamespace(angles=np.zeros(1), max_range=card.max_range)
+        rays = {"angles": np.zeros(1), "mount": (0.0, 0.0)}
+        lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
         self._room: Any = SimpleNamespace(size=(size, size))
         self._center = np.zeros(2)

@@ -11,7 +11,7 @@ import numpy as np
 from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
-from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
+from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
@@ -35,6 +35,8 @@ _PARTS: Final = 5
 """Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
+_BESIDE: Final = 0.01
+"""Cosine above which a direction is ahead."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
@@ -306,6 +308,11 @@ class Pilot:
             right = min(max(0.5 * (right - left), -most), most)
             left = -right
         if self._keep is not None:
+            if (np.cos(blind) > _BESIDE).any():
+                raise ScanError(
+                    "the scan must look at all directions up to 90 degrees from ahead for the "
+                    "filter (clearance), which does not drive beside what is not seen"
+                )
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             observation[: self.card.sectors][hidden] = 1.0
             slow, fast = learned.min_wheel_speed, learned.max_wheel_speed

@@ -160,8 +160,8 @@ class TaskConfig:
     """Errors of the lidar, the wheels, the time and the odometry, none by default: a
     :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
     closeness_distance: float = None  # type: ignore[assignment]
-    """A range of this or less has closeness one [m]. None: the robot's radius and the clearance,
-    with ``contact`` too."""
+    """A range of this or less has closeness one [m]. None: the least distance from the lidar to
+    the robot's rim and the clearance, with ``contact`` too."""
     min_goal_distance: float = 2.0
     """Least distance between a sampled start and goal [m]."""
     detour_chance: float = 0.8
@@ -173,7 +173,7 @@ class TaskConfig:
         self._set("robot", robot)
         if self.closeness_distance is None:
             clearance = check_not_negative("clearance", self.clearance)
-            self._set("closeness_distance", round(robot.radius + clearance, 9))
+            self._set("closeness_distance", round(robot.lidar_to_rim + clearance, 9))
         self._set("noise", resolve_noise(self.noise))
         for name, check in _CHECKS.items():
             self._set(name, check(name, getattr(self, name)))
@@ -229,7 +229,7 @@ class TaskConfig:
     def make_lidar(self, world: World = _EMPTY) -> Lidar:
         """Make the lidar, in a world."""
         try:
-            return Lidar(world, **self.lidar)
+            return Lidar(world, **self.lidar, mount=self.robot.lidar_mount[:2])
         except TypeError as error:
             raise ValueError(
                 f"lidar must hold arguments of Lidar, got {self.lidar!r}: {error}"
@@ -262,20 +262,26 @@ class TaskConfig:
         """Make the transform that shows a learner half of its transitions in the mirror.
 
         Front and rear are swapped as well if robot and lidar have them alike: wheels that are as
-        fast backwards, and a whole turn of sectors.
+        fast backwards, and a whole turn of sectors around the center.
 
         Args:
             pairs: As for :class:`~mpfa_envs.Mirror`; with these front and rear stay.
 
         Raises:
-            ValueError: If a pair has no mirror image among them.
+            ValueError: If a pair has no mirror image among them, or the lidar is at a side.
         """
         # Most of what a task is for needs no PyTorch.
         from mpfa_envs.sensing.mirror import RandomMirror
 
         lidar, robot = self.make_lidar(), self.robot
         all_around = lidar.field_of_view == 360.0 and lidar.sectors % 2 == 0
-        alike = all_around and robot.min_wheel_speed == -robot.max_wheel_speed
+        if lidar.mount[1]:
+            raise ValueError(
+                f"mirror must be False for {robot.name!r}, whose lidar is {lidar.mount[1]:g} m to "
+                "the left of its axis (lidar_mount): left and right differ"
+            )
+        alike = all_around and robot.reverse and robot.min_wheel_speed == -robot.max_wheel_speed
+        alike = alike and not lidar.mount[0]
         return RandomMirror(
             sectors=lidar.sectors,
             memory=self.memory,
@@ -332,6 +338,7 @@ class TaskConfig:
             described.update(zip(_PAYMENTS, payments, strict=True))
         lidar = self.make_lidar()
         described.update(rays=lidar.angles.size, sectors=lidar.sectors)
+        described["lidar.mount"] = list(lidar.mount)
         return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}
 
 

@@ -303,7 +303,7 @@ class RobotBatch:
                 goal=tuple(self.episodes.goals[index].tolist()),
                 goal_radius=self._config.goal_radius,
                 trail=self.trail(index),
-                rays=(self._lidar.angles, self.ranges[index].copy()),
+                rays=self._lidar.around_center(self.ranges[index].copy()),
                 sketch=None if self.memory is None else self.memory.sketch(index, x, y),
                 walkers=self.walkers.of(index),
             )

@@ -245,13 +245,14 @@ class DynamicWindow:
         closeness = row[self._parts["lidar"]]
         ranges = self.closeness_distance / np.maximum(closeness, 1e-9)
         met = ranges < 0.999 * self._lidar.max_range
-        points = self._directions[met] * ranges[met, None]
+        points = self._directions[met] * ranges[met, None] + self._lidar.mount
         if not len(points):
             return np.full(arcs.shape[:2], math.inf)
         gaps = arcs[:, :, None, :] - points
         squares = np.einsum("ktpc,ktpc->ktp", gaps, gaps)
         # What is nearer already counts as if it were as far as it may be, and may not get nearer.
-        spare = np.maximum(self.robot.radius + self.score.least + 1e-9 - ranges[met], 0.0)
+        away = np.hypot(*points.T) if any(self._lidar.mount) else ranges[met]
+        spare = np.maximum(self.robot.radius + self.score.least + 1e-9 - away, 0.0)
         return np.asarray((np.sqrt(squares) + spare).min(axis=2) - self.robot.radius)
 
     def _heading(

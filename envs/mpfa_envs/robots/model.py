@@ -25,6 +25,8 @@ PAPER_CLEARANCE: Final = 0.17
 A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
 """
 
+_NEAREST: Final = 0.05
+"""Least distance at which ranges can be told apart [m]."""
 _OPTIONAL: Final = ("wheel_acceleration", "deceleration", "turn_limit", "turn_acceleration")
 """Numbers that may be None."""
 _LEVEL: Final = math.radians(10.0)
@@ -60,8 +62,8 @@ class RobotModel:
             of 10 degrees, but at most three; None: three.
         lidar_range: A ray that meets nothing within this distance reports this distance [m].
         lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
-            [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. A pilot reads
-            scans by it; in training rays begin at the robot's center.
+            [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. Rays begin
+            there. A pilot turns scans by the angles, and in training the lidar looks ahead.
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
@@ -161,6 +163,11 @@ class RobotModel:
     def can_stop(self) -> bool:
         """True if it can stand still: both wheels may have a speed of zero."""
         return self.min_wheel_speed <= 0.0 <= self.max_wheel_speed
+
+    @property
+    def lidar_to_rim(self) -> float:
+        """Least distance from the lidar to the rim [m]; 0.05 m for a lidar that is nearer."""
+        return max(self.radius - math.hypot(*self.lidar_mount[:2]), _NEAREST)
 
     @property
     def wheel_limits(self) -> WheelLimits:

@@ -48,6 +48,7 @@ def filter_actions(
     actions: NDArray[np.float64],  # wanted, in [-1, 1], [N, 2]
     ranges: NDArray[np.float64],  # of the rays, [N, R] [m]; infinite where they hit nothing
     directions: NDArray[np.float64],  # of the rays, cosine and sine, [2, R]
+    origins: NDArray[np.float64],  # of the rays, x and y in the robot's frame [m], [2, R]
     speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2]
     candidates: NDArray[np.float64],  # actions to choose among, [K, 2]; the last one is safe
     body: Body,
@@ -62,7 +63,7 @@ def filter_actions(
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         chosen[robot] = actions[robot]
-        count = _near_points(ranges[robot], directions, speeds[robot], body, points)
+        count = _near_points(ranges[robot], directions, origins, speeds[robot], body, points)
         if count == 0 or _is_admissible(wanted[robot], speeds[robot], points[:count], body):
             continue
         gaps = np.empty(last)
@@ -87,6 +88,7 @@ def filter_actions(
 def _near_points(
     ranges: NDArray[np.float64],
     directions: NDArray[np.float64],
+    origins: NDArray[np.float64],
     speeds: NDArray[np.float64],
     body: Body,
     points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
@@ -101,14 +103,19 @@ def _near_points(
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
-        if ranges[ray] <= reach + kept:
-            points[count, 0] = ranges[ray] * directions[0, ray]
-            points[count, 1] = ranges[ray] * directions[1, ray]
+        x = origins[0, ray] + ranges[ray] * directions[0, ray]
+        y = origins[1, ray] + ranges[ray] * directions[1, ray]
+        away = ranges[ray]
+        if origins[0, ray] != 0.0 or origins[1, ray] != 0.0:
+            away = math.hypot(x, y)
+        if away <= reach + kept:
+            points[count, 0] = x
+            points[count, 1] = y
             # What is nearer already may come nearer by a share of what is left, which lets the
             # robot pass by it, but not nearer than the least.
-            left = (1.0 - _SHARE) * (ranges[ray] - body.radius)
+            left = (1.0 - _SHARE) * (away - body.radius)
             left = max(left, _LEAST * body.clearance)
-            distance = min(ranges[ray], kept, body.radius + left) - _TOUCH
+            distance = min(away, kept, body.radius + left) - _TOUCH
             points[count, 2] = distance * distance
             count += 1
     return count

@@ -54,7 +54,7 @@ class MapMemory:
     Args:
         count: Number of robots N.
         robot: Robot whose radius decides where its center fits.
-        lidar: The robots' lidar; its ``angles`` and ``max_range`` count.
+        lidar: The robots' lidar; its ``angles``, ``max_range`` and ``mount`` count.
 
     Examples:
         >>> from mpfa_envs import Box, Lidar, World
@@ -81,6 +81,7 @@ class MapMemory:
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         bounds = robot.radius, robot.radius + _TIGHT, robot.radius + _NEAR
         self._lengths = RESOLUTION, *bounds, lidar.max_range
+        self._mount = lidar.mount
 
     def begin(self, index: int, world: World) -> None:
         """Clear a robot's map.
@@ -125,8 +126,8 @@ class MapMemory:
         if chosen is None:
             chosen = np.ones(len(motions), dtype=np.bool_)
         directions = self._directions if directions is None else directions
-        lengths = self._lengths
-        remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._paths)
+        how = self.arrays, self._lengths, self._mount
+        remember(motions, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
 
     def sketch(self, index: int, x: float, y: float) -> Sketch:

@@ -47,6 +47,31 @@ def test_an_error_in_the_file_names_the_setting_and_the_line(tmp_path: Path) -> 
         asked(tmp_path / "none.yaml")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "view: 360",
+            "view: 90",
+            r"environment.field_of_view must be at least 180 degrees for a f",
+        ),
+        ("[0.1, 0.0", "[0.1, 0.05", "environment.mirror must be False for 'cart', whose lidar is"),
+    ],
+)
+def test_a_lidar_that_does_not_fit_the_training_is_named_before_it_starts(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "cart.yaml"
+    text = EXAMPLE_ROBOT.read_text(encoding="utf-8").replace(old, new)
+    file.write_text(text, encoding="utf-8")
+    register()
+    words = [f"environment.robot={file}", "regime=rooms", "learner=td3", "actions=100"]
+    with pytest.raises(ValueError, match=message):
+        next(iter(composed(words)))
+    for settings in composed([*words, "environment.filter=0", "environment.mirror=false"]):
+        assert settings.environment.filter == 0.0
+
+
 def test_a_run_resumes_and_its_policy_drives_without_the_file(tmp_path: Path) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     settings = tiny()
