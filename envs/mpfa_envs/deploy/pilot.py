@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.deploy.map_path import MapPath
+    from mpfa_envs.deploy.map_path import MapPath, Plan
+    from mpfa_envs.worlds.world import World
 
 _WIDER: Final = 0.01
 """A robot's radius may exceed that in training by this [m]."""
@@ -78,7 +79,7 @@ class Pilot:
         unseen: As there.
         silent: As there.
         map_size: Side of the map of a policy that has one [m], a square around the robot's first
-            position; the path leads through it alone.
+            position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
 
@@ -134,7 +135,7 @@ class Pilot:
             # Imported here because it needs Numba, and compiled before the first decision is due.
             from mpfa_envs.deploy.map_path import MapPath
 
-            self._map = MapPath(card, size=self._map_size)
+            self._map = MapPath(card)
         if clearance is not None and not learned.can_stop:
             raise ValueError(
                 f"clearance must be None for a policy of {learned.name}, whose wheels turn at "
@@ -144,6 +145,8 @@ class Pilot:
         self._keep = None if clearance is None else self._filter(clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
+        self._plan: Plan | None = None
+        self._fresh_map = False
         self._fresh = True
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
@@ -177,22 +180,41 @@ class Pilot:
         return self._goal
 
     def begin(
-        self, goal: tuple[float, float], *, map_center: tuple[float, float] | None = None
+        self,
+        goal: tuple[float, float],
+        *,
+        map_center: tuple[float, float] | None = None,
+        plan: World | None = None,
+        plan_pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Set out for a goal with an empty memory.
+        """Set out for a goal with an empty memory, or with a plan.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
             map_center: Center of the map of a policy that has one (x, y) [m]; None: where the robot
                 is at its first decision.
+            plan: The building, for a policy with a map, which then begins with its walls; scans
+                add what the plan does not have. None: the map begins empty.
+            plan_pose: Of the plan's frame, that of its coordinates or of its ROS map, in the frame
+                of the odometry (x, y, heading) [m, m, rad].
 
         Raises:
-            ValueError: If a number is not finite or beyond 1e7 m, or the goal is not on the map.
+            ValueError: If a number is not finite or beyond 1e7 m, the goal is not on the map, or
+                there is a plan without a map or with a center.
         """
         center = None if map_center is None else _pair("map_center", map_center)
         goal = _pair("goal", goal)
-        self._check_on_map(goal, center)
-        self._goal, self._center, self._fresh = goal, center, True
+        known = None
+        if plan is not None:
+            if self._map is None or center is not None:
+                raise ValueError(
+                    "plan must be None for a policy without a map (memory='map'), and with a "
+                    f"map_center, got {plan.name!r}"
+                )
+            known = _placed(plan, plan_pose)
+            center = known.middle
+        self._check_on_map(goal, center, known)
+        self._goal, self._center, self._plan, self._fresh = goal, center, known, True
 
     def stop(self) -> None:
         """Give up the goal."""
@@ -211,10 +233,27 @@ class Pilot:
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
         if (goal := _pair("goal", goal)) != self._goal:
-            self._check_on_map(goal, self._center)
+            self._check_on_map(goal, self._center, self._plan)
             self._goal = goal
             if self._map is not None:
                 self._map.look_again()
+
+    def move_plan(self, pose: tuple[float, float, float]) -> None:
+        """Correct the pose of the plan while driving, as localization does.
+
+        Where walls would be in other cells, the map begins again.
+
+        Args:
+            pose: As ``plan_pose`` of :meth:`begin` [m, m, rad].
+
+        Raises:
+            ValueError: If a number is not finite or too large, or there is no plan.
+        """
+        if self._plan is None:
+            raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
+        moved = _placed(self._plan.world, pose)
+        if self._plan.is_off(moved.pose):
+            self._plan, self._center, self._fresh_map = moved, moved.middle, True
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
         """Return True if a pose is at the goal, as the training counted it."""
@@ -252,13 +291,13 @@ class Pilot:
         card = self.card
         taken = (x, y, heading) if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
         center = self._center or (x, y)
-        self._check_on_map(self._goal, center)
+        self._check_on_map(self._goal, center, self._plan)
         ranges, points = self.sectors.read(scan)
         path = np.zeros((0, 3))
         if self._map is not None:
-            if self._fresh:
-                self._map.begin(center)
-                self._center = center
+            if self._fresh or self._fresh_map:
+                self._map.begin(center, self._sides(self._plan), self._plan)
+                self._center, self._fresh_map = center, False
             if taken != (x, y, heading):
                 points = points.seen_from((x, y, heading), taken, card.max_range)
             path = self._map.sense((x, y, heading), self._goal, points)
@@ -372,15 +411,34 @@ class Pilot:
             clearance=clearance,
         )
 
-    def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
+    def _sides(self, plan: Plan | None) -> tuple[float, float]:
+        """Width and depth of the map [m]."""
+        return (self._map_size, self._map_size) if plan is None else plan.size
+
+    def _check_on_map(
+        self, goal: tuple[float, float], center: tuple[float, float] | None, plan: Plan | None
+    ) -> None:
         """Reject a goal beyond the map, once its center is known."""
         if self._map is None or center is None:
             return
-        if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * self._map_size:
+        width, depth = self._sides(plan)
+        if abs(goal[0] - center[0]) > 0.5 * width or abs(goal[1] - center[1]) > 0.5 * depth:
+            size = (
+                f"{width:g} m (map_size)" if plan is None else f"{width:g} m x {depth:g} m (plan)"
+            )
             raise ValueError(
-                f"goal must be on the map, {self._map_size:g} m (map_size) around "
+                f"goal must be on the map, {size} around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
+
+
+def _placed(world: World, pose: tuple[float, float, float]) -> Plan:
+    """A plan at a pose."""
+    # Imported here because it needs Numba.
+    from mpfa_envs.deploy.map_path import Plan
+
+    x, y, heading = check_finite("plan_pose", pose, 3)
+    return Plan(world, (*_pair("plan_pose", (x, y)), heading))
 
 
 def _widening(robot: RobotModel, learned: RobotModel) -> float:

@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 Progress = Literal["straight_line", "shortest_path", "none"]
 """Measure of the reward's progress."""
 
+Knowledge = Literal["unknown", "known"]
+"""What a robot's map knows when an episode begins."""
+
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "action_repeat": 1,
@@ -55,6 +58,7 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "contact": partial(check_choice, kinds=Literal[True, False]),
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
+    "plan": partial(check_choice, kinds=Knowledge),
     "progress_scale": check_number,
     "clearance": check_not_negative,
     "max_steps": partial(check_count, most=_MOST_STEPS),
@@ -153,6 +157,9 @@ class TaskConfig:
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
     before it and nothing else."""
+    plan: Knowledge = "unknown"
+    """``"known"``: the robot's map begins with all obstacles and walls that stand, as a robot that
+    was given the plan of its building; ``"unknown"``: it begins empty."""
     history: int = 0
     """Number of earlier scans that it senses in addition to the last one, sector by sector: those
     of the decisions before, the newest first, which show what moves."""
@@ -181,6 +188,11 @@ class TaskConfig:
             raise ValueError(
                 f"min_goal_distance must be above goal_radius = {self.goal_radius}, "
                 f"got {self.min_goal_distance}"
+            )
+        if self.plan == "known" and self.memory != "map":
+            raise ValueError(
+                f"plan must be 'unknown' without a map (memory='map'), got {self.plan!r} with "
+                f"memory={self.memory!r}"
             )
         # Collisions are checked at the end of each time step. A robot that drives no farther than
         # the collision distance in one cannot get its center into an obstacle in between.
