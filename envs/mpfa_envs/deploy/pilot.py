@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_positive, check_share
+from mpfa_envs.checks import check_number, check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
@@ -38,6 +38,12 @@ _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
 _BESIDE: Final = 0.01
 """Cosine above which a direction is ahead."""
+_FACING: Final = math.radians(5.0)
+"""Error of the heading at a goal [rad]."""
+_STANDS: Final = 0.03
+"""Speed below which a robot stands, and may turn at the goal [m/s]."""
+_LAST: Final = 0.02
+"""Distance from the goal below which the robot drives no more slowly [m]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
@@ -82,6 +88,9 @@ class Pilot:
             position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
+        goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
+            Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
+            where it arrives.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -101,6 +110,7 @@ class Pilot:
         silent: Silent = "reject",
         map_size: float = 40.0,
         clearance: float | None = None,
+        goal_radius: float | None = None,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -130,6 +140,11 @@ class Pilot:
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)
+        self.goal_radius = card.goal_radius
+        if goal_radius is not None:
+            self.goal_radius = check_positive("goal_radius", goal_radius)
+        self._heading: float | None = None
+        self._there = False
         self._map: MapPath | None = None
         if card.memory == "map":
             # Imported here because it needs Numba, and compiled before the first decision is due.
@@ -179,6 +194,16 @@ class Pilot:
         """The goal (x, y) [m]; None without."""
         return self._goal
 
+    @property
+    def plan(self) -> World | None:
+        """The building that :meth:`begin` was given; None without, and without a goal."""
+        return None if self._plan is None or self._goal is None else self._plan.world
+
+    @property
+    def turns_on_the_spot(self) -> bool:
+        """True if the robot can turn on the spot, as a heading at the goal needs."""
+        return self._spot_speed() > 0.0
+
     def begin(
         self,
         goal: tuple[float, float],
@@ -186,6 +211,7 @@ class Pilot:
         map_center: tuple[float, float] | None = None,
         plan: World | None = None,
         plan_pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        heading: float | None = None,
     ) -> None:
         """Set out for a goal with an empty memory, or with a plan.
 
@@ -197,11 +223,19 @@ class Pilot:
                 add what the plan does not have. None: the map begins empty.
             plan_pose: Of the plan's frame, that of its coordinates or of its ROS map, in the frame
                 of the odometry (x, y, heading) [m, m, rad].
+            heading: Direction to which the robot turns on the spot at the goal, in the frame of the
+                odometry [rad]; None: any.
 
         Raises:
-            ValueError: If a number is not finite or beyond 1e7 m, the goal is not on the map, or
-                there is a plan without a map or with a center.
+            ValueError: If a number is not finite or beyond 1e7 m, the goal is not on the map, there
+                is a plan without a map or with a center, or a heading for a robot that cannot turn
+                on the spot.
         """
+        if heading is not None and not self.turns_on_the_spot:
+            raise ValueError(
+                f"heading must be None for {self.robot.name}, which cannot turn on the spot "
+                f"(min_wheel_speed = {self.robot.min_wheel_speed}), got {heading}"
+            )
         center = None if map_center is None else _pair("map_center", map_center)
         goal = _pair("goal", goal)
         known = None
@@ -214,17 +248,20 @@ class Pilot:
             known = _placed(plan, plan_pose)
             center = known.middle
         self._check_on_map(goal, center, known)
+        self._heading = None if heading is None else check_number("heading", heading)
         self._goal, self._center, self._plan, self._fresh = goal, center, known, True
+        self._there = False
 
     def stop(self) -> None:
         """Give up the goal."""
         self._goal = None
 
-    def move_goal(self, goal: tuple[float, float]) -> None:
+    def move_goal(self, goal: tuple[float, float], *, heading: float | None = None) -> None:
         """Correct the goal while driving; the map is kept.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
+            heading: As for :meth:`begin`; None: as it was.
 
         Raises:
             ValueError: If it is not finite, beyond 1e7 m or not on the map, or the robot has not
@@ -232,6 +269,8 @@ class Pilot:
         """
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
+        if heading is not None and self._heading is not None:
+            self._heading = check_number("heading", heading)
         if (goal := _pair("goal", goal)) != self._goal:
             self._check_on_map(goal, self._center, self._plan)
             self._goal = goal
@@ -256,8 +295,16 @@ class Pilot:
             self._plan, self._center, self._fresh_map = moved, moved.middle, True
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
-        """Return True if a pose is at the goal, as the training counted it."""
-        return self._goal is not None and math.dist(pose[:2], self._goal) <= self.card.goal_radius
+        """Return True if a pose is at the goal, with the heading that :meth:`begin` was given."""
+        if self._goal is None:
+            return False
+        # The robot takes a little way to stop.
+        near = (2.0 if self._there else 1.0) * self.goal_radius
+        there = math.dist(pose[:2], self._goal) <= near
+        if self._heading is None:
+            return there
+        self._there = there
+        return there and abs(math.remainder(self._heading - pose[2], math.tau)) <= _FACING
 
     def observe(
         self,
@@ -332,13 +379,18 @@ class Pilot:
         Returns:
             The speeds.
         """
+        if self._heading is not None and not self.arrived(pose) and self._there:
+            return self._turn(self._heading - pose[2], speeds[0])
         observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
         blind, hidden = self.sectors.blind(scan)
+        slower = self._landing(pose)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         learned = self.card.robot
         left, right = learned.wheel_speeds(action)
+        share = min(1.0, slower / max(abs(left + right) / 2.0, 1e-9))
+        left, right = share * left, share * right
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         backwards = left + right < 0.0 and not self.robot.reverse
         if backwards or (np.abs(towards) < _TOWARDS).any():
@@ -358,9 +410,39 @@ class Pilot:
             action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
             left, right = learned.wheel_speeds(self._keep(observation, action))
         linear = self.pace * 0.5 * (left + right)
-        angular = self.pace * (right - left) / learned.wheel_base
+        return self._command(linear, self.pace * (right - left) / learned.wheel_base)
+
+    def _command(self, linear: float, angular: float) -> Command:
+        """The command for speeds of the body [m/s, rad/s]."""
         turn = 0.5 * angular * self.robot.wheel_base
         return Command(linear - turn, linear + turn, linear, angular)
+
+    def _landing(self, pose: tuple[float, float, float]) -> float:
+        """Greatest speed of the policy's robot with which it stops at the goal [m/s]."""
+        as_learned = self._heading is None and self.goal_radius >= self.card.goal_radius
+        if self._goal is None or as_learned or not self.robot.can_stop:
+            return math.inf
+        away = math.dist(pose[:2], self._goal)
+        # Half the braking, as decisions are late; what remains at the goal is stopped within it.
+        braking = self.robot.wheel_limits.acceleration / self.pace**2
+        return math.inf if math.isinf(braking) else math.sqrt(braking * max(away, _LAST))
+
+    def _spot_speed(self) -> float:
+        """Fastest turn on the spot [rad/s]."""
+        robot = self.robot
+        wheels = min(robot.max_wheel_speed, -robot.min_wheel_speed)
+        return min(robot.max_angular_speed, 2.0 * wheels / robot.wheel_base)
+
+    def _turn(self, off: float, speed: float) -> Command:
+        """The command that turns a robot with a speed [m/s] by an angle at the goal [rad]."""
+        if abs(speed) > _STANDS:
+            return self._command(0.0, 0.0)
+        off, limits = math.remainder(off, math.tau), self.robot.wheel_limits
+        change = 2.0 * min(limits.acceleration, limits.turning) / self.robot.wheel_base
+        fastest = min(self._spot_speed(), 0.5 * abs(off) / self.period)
+        if math.isfinite(change):
+            fastest = min(fastest, math.sqrt(change * abs(off)))
+        return self._command(0.0, math.copysign(fastest, off))
 
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
