@@ -41,6 +41,7 @@ from mpfa_envs import (
     POLICIES,
     Policy,
     RobotNoise,
+    TaskConfig,
     load_policy,
     make_planner,
 )
@@ -141,6 +142,14 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
         "policies that had it in all of their training)",
     )
+    parser.add_argument(
+        "--plan",
+        choices=["unknown", "known"],
+        help="known: the robot's map begins with the world's walls (default: as in training)",
+    )
+    parser.add_argument(
+        "--goal-radius", type=float, help="distance that reaches the goal [m] (default: likewise)"
+    )
     add_plugin(parser)
     parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
@@ -163,6 +172,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             options.filter = needs_filter(options.loaded)
         options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
         check_physics(options.physics)
+        options.task = {
+            name: value
+            for name in ("plan", "goal_radius")
+            if (value := getattr(options, name)) is not None
+        }
+        TaskConfig(**options.loaded.env_arguments | options.task)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -207,6 +222,7 @@ def output_folder(options: argparse.Namespace) -> Path:
         noise=options.noise,
         filtered=options.filter,
         robot=options.robot if options.policy is None else None,
+        task=options.task,
     )
     policy = options.path
     if policy is None:
@@ -319,12 +335,17 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     folder = options.output or output_folder(options)
     physics = options.physics
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
-    how = {"noise": options.noise, "physics": physics}
+    how = {"noise": options.noise, "physics": physics, **options.task}
     if options.live:
         return show_live(driver, options, how)
     with held(folder):
         driven = drive(
-            driver, options.names, noise=options.noise, progress=not options.no_pictures, **asked
+            driver,
+            options.names,
+            noise=options.noise,
+            progress=not options.no_pictures,
+            **asked,
+            **options.task,
         )
         results = [result for drives in driven for result in drives.results]
         rows = [
@@ -343,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        document: dict[str, Any] = {"words": options.worlds, **asked}
+        document: dict[str, Any] = {"words": options.worlds, **asked, **options.task}
         if options.filter:
             document["filter"] = {"clearance": CLEARANCE}
         if options.noise is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
 from itertools import accumulate
+from types import MappingProxyType
 from typing import Any
 
 from mpfa_envs import (
@@ -53,6 +54,7 @@ def evaluation_folder(
     noise: RobotNoise | None = None,
     filtered: bool = False,
     robot: RobotModel | None = None,
+    task: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
     """Name of the folder of an evaluation: each choice has its own.
 
@@ -66,6 +68,7 @@ def evaluation_folder(
             f"evaluation-{worlds_label(words)}-{physics}",
             "-filter" if filtered else "",
             f"-{robot.name}" if robot is not None else "",
+            *(f"-{name}-{value}" for name, value in task.items()),
             f"-seed{seed}" if seed else "",
             *(f"-{what}{value:g}" for what, value in errors.items() if value),
         ]
@@ -137,13 +140,14 @@ def drive(
     physics: str | None,
     noise: RobotNoise | None = None,
     progress: bool,
+    **task: Any,
 ) -> list[Drives]:
     """Drive a policy through fixed tasks of each world, as :func:`mpfa_envs.evaluate`.
 
-    Contact is the only collision. Return tasks, results and paths of each world; these do not
-    depend on the other worlds.
+    Contact is the only collision, and ``task`` has further arguments. Return tasks, results and
+    paths of each world; these do not depend on the other worlds.
     """
-    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise, **task}
     if physics is not None:
         arguments["physics"] = physics
     sets = [tasks_of(policy, [each], episodes=episodes, seed=seed) for each in worlds]
