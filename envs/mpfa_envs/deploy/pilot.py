@@ -238,18 +238,18 @@ class Pilot:
             )
         center = None if map_center is None else _pair("map_center", map_center)
         goal = _pair("goal", goal)
-        known = None
+        placed = None
         if plan is not None:
             if self._map is None or center is not None:
                 raise ValueError(
                     "plan must be None for a policy without a map (memory='map'), and with a "
                     f"map_center, got {plan.name!r}"
                 )
-            known = _placed(plan, plan_pose)
-            center = known.middle
-        self._check_on_map(goal, center, known)
+            placed = _placed(plan, plan_pose)
+            center = placed.middle
+        self._check_on_map(goal, center, placed)
         self._heading = None if heading is None else check_number("heading", heading)
-        self._goal, self._center, self._plan, self._fresh = goal, center, known, True
+        self._goal, self._center, self._plan, self._fresh = goal, center, placed, True
         self._there = False
 
     def stop(self) -> None:
@@ -461,7 +461,7 @@ class Pilot:
         if math.isinf(min(limits.acceleration, limits.turning)):
             return wanted
         half = 0.5 * self.card.robot.wheel_base
-        now, to = ((each[0] - half * each[1], each[0] + half * each[1]) for each in (last, wanted))
+        now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
         left, right = changed(now, to, limits, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half
 
@@ -547,9 +547,9 @@ def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
     pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
     if robot.turn_limit is not None:
         pace = min(pace, robot.turn_limit / learned.max_angular_speed)
-    known = learned.wheel_limits.acceleration * _widening(robot, learned)
+    changes = learned.wheel_limits.acceleration * _widening(robot, learned)
     for can, does in (
-        (robot.wheel_limits.acceleration, known),
+        (robot.wheel_limits.acceleration, changes),
         (_turning(robot), _turning(learned)),
     ):
         if math.isfinite(can) and math.isfinite(does):

@@ -97,8 +97,8 @@ class EpisodeSource:
         self._difficulty = difficulty
         fixed = [] if self._generator else _resolve_worlds(world)
         kept = max(config.collision_distance - config.robot.radius, CLEARANCE)
-        for each in dict.fromkeys(fixed):
-            warn_of_parts(each, config.robot, kept)
+        for place in dict.fromkeys(fixed):
+            warn_of_parts(place, config.robot, kept)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
         self.begins: dict[int, Beginning] = {}

@@ -136,8 +136,8 @@ class RobotBatch:
         if self.noise is not None:
             self.noise.begin(index, (x, y, heading), rng)
         if self.memory is not None:
-            known = self._config.plan == "known"
-            self.memory.begin(index, episode.world, plan=episode.world if known else None)
+            plan = episode.world if self._config.plan == "known" else None
+            self.memory.begin(index, episode.world, plan=plan)
 
     def wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         """Speeds [m/s] of the left and the right wheel, ``[N, 2]``, by actions of that shape."""

@@ -135,8 +135,8 @@ class DynamicWindow:
         self.closeness_distance = task.closeness_distance
         limits = self.robot.wheel_limits
         if acceleration is None:
-            known = limits.acceleration
-            acceleration = _ACCELERATION if math.isinf(known) else known
+            unlimited = math.isinf(limits.acceleration)
+            acceleration = _ACCELERATION if unlimited else limits.acceleration
         self.change = check_positive("acceleration", acceleration) * check_positive(
             "decision", decision
         )

@@ -54,7 +54,8 @@ class RobotModel:
         turn_acceleration: How fast its turn changes, where its wheels could change it faster
             [rad/s²]; None: as they can.
         reverse: False if its controller does not let the body drive backwards; its wheels still
-            turn it on the spot.
+            turn it on the spot. Give the ``min_wheel_speed`` that this takes and no less, as a
+            policy learns slowly where most actions turn it on the spot.
         field_of_view: Angle that its lidar sees, which its front halves [deg]. The default does not
             fit a robot that reverses: filter, dynamic window and pilot keep it from driving where
             it does not see. Give 360.
@@ -172,10 +173,10 @@ class RobotModel:
     @property
     def wheel_limits(self) -> WheelLimits:
         """Limits of the wheels, as compiled loops read them."""
-        change = min(each or math.inf for each in (self.wheel_acceleration, self.deceleration))
+        change = min(self.wheel_acceleration or math.inf, self.deceleration or math.inf)
         across, turning = (
-            math.inf if each is None else 0.5 * each * self.wheel_base
-            for each in (self.turn_limit, self.turn_acceleration)
+            math.inf if limit is None else 0.5 * limit * self.wheel_base
+            for limit in (self.turn_limit, self.turn_acceleration)
         )
         slow, fast = self.min_wheel_speed, self.max_wheel_speed
         return WheelLimits(slow, fast, across, change, turning, self.reverse)

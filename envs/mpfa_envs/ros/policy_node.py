@@ -150,15 +150,19 @@ class PolicyNode(Node):
         # A map that comes while the robot drives is for the next goal.
         self._plan = (*plan_of(message), message.header.frame_id)
 
+    def _place_plan(self) -> None:
+        """Give the controller the plan, where localization has it."""
+        if self._plan is not None:
+            plan, pose, frame = self._plan
+            self.controller.know(plan, self._in_odometry(pose, frame))
+
     def _set_out(self) -> None:
         """Set out for the goal if its place is known; else it is tried again at each check."""
         if self._goal is None:
             return
         try:
             x, y, heading = self._in_odometry(*self._goal)
-            if self._plan is not None:
-                plan, *where = self._plan
-                self.controller.know(plan, self._in_odometry(*where))
+            self._place_plan()
             self.controller.aim((x, y), heading=None if math.isnan(heading) else heading)
         # What tf2 raises has no public base class.
         except Exception as error:
@@ -187,14 +191,12 @@ class PolicyNode(Node):
 
     def _correct(self) -> None:
         """Update goal and plan by the newest transform; an old one keeps the robot standing."""
-        frames = {each[-1] for each in (self._goal, self._plan) if each}
+        frames = {placed[-1] for placed in (self._goal, self._plan) if placed}
         if self._goal is None or not frames - {"", self._odometry_frame}:
             return
         try:
             x, y, heading = self._in_odometry(*self._goal)
-            if self._plan is not None:
-                plan, *where = self._plan
-                self.controller.know(plan, self._in_odometry(*where))
+            self._place_plan()
             self.controller.correct_goal((x, y), None if math.isnan(heading) else heading)
         # As above; a correction that fails once is made later.
         except Exception as error:
