@@ -75,17 +75,17 @@ def changed(
     now: tuple[float, float], wanted: tuple[float, float], limits: WheelLimits, time: float
 ) -> tuple[float, float]:
     """The speeds nearest to the wanted ones that the wheels can have after a time [m/s, s]."""
-    (left, right), (to_left, to_right) = now, wanted
+    left, right = now
     change, most = limits.acceleration * time, limits.turning * time
+    to_left = min(max(wanted[0], left - change), left + change)
+    to_right = min(max(wanted[1], right - change), right + change)
     across = 0.5 * ((to_right - right) - (to_left - left))
+    # The forward speed changes as it would, and the turn as fast as it may.
     if abs(across) > most:
         forward = 0.5 * ((to_right - right) + (to_left - left))
         across = math.copysign(most, across)
         to_left, to_right = left + forward - across, right + forward + across
-    return (
-        min(max(to_left, left - change), left + change),
-        min(max(to_right, right - change), right + change),
-    )
+    return to_left, to_right
 
 
 @njit
