@@ -106,6 +106,13 @@ def test_a_robot_turns_and_brakes_no_faster_than_its_controller_allows(
     assert np.abs(aim).sum() < np.abs(before).sum()
 
 
+def test_a_robot_with_a_limited_turn_begins_to_turn_while_it_drives_off() -> None:
+    robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, turn_acceleration=4.0)
+    speeds = driven_from(robot, (0.0, 0.0), (-0.1, 0.7))
+    assert speeds[4, 1] == pytest.approx(5 * 4.0 * 0.02)
+    assert speeds[-1] == pytest.approx((0.3, math.pi))
+
+
 @pytest.mark.parametrize(
     ("action", "forward", "turn"),
     [((-1, -1), 0.0, 0.0), ((-1, 0), 0.0, 1.75), ((-1, 1), 0.2, 3.5), ((0, 1), 0.55, 1.75)],

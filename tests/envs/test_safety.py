@@ -108,6 +108,16 @@ def test_a_random_policy_touches_nothing_wherever_its_lidar_is(
     assert drive_at_random(robot, world, 2_000, **arguments) > 0.0
 
 
+@pytest.mark.parametrize("turning", [0.5, 2.0])
+@pytest.mark.parametrize("reverse", [True, False])
+def test_a_random_policy_touches_nothing_whatever_the_controller(
+    turning: float, reverse: bool
+) -> None:
+    limits = {"deceleration": 0.5, "turn_acceleration": turning, "reverse": reverse}
+    robot = replace(ROBOTS["kobuki"], **limits)
+    assert drive_at_random(robot, "rooms", 3_000, physics="kinematic", robots=20) > 0.0
+
+
 @pytest.mark.parametrize("view", [180.0, 240.0])
 @pytest.mark.parametrize("x", [0.12, 0.0, -0.1])
 def test_a_robot_drives_in_a_hall_wherever_its_lidar_is(x: float, view: float) -> None:
