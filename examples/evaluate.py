@@ -39,6 +39,7 @@ from mpfa_envs import (
     POLICIES,
     Policy,
     RobotNoise,
+    TaskConfig,
     load_policy,
     make_planner,
 )
@@ -146,6 +147,14 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
         "policies that had it in all of their training)",
     )
+    parser.add_argument(
+        "--plan",
+        choices=["unknown", "known"],
+        help="known: the robot's map begins with the world's walls (default: as in training)",
+    )
+    parser.add_argument(
+        "--goal-radius", type=float, help="distance that reaches the goal [m] (default: likewise)"
+    )
     add_plugin(parser)
     parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
@@ -168,6 +177,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             options.filter = needs_filter(options.loaded)
         options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
         check_physics(options.physics)
+        options.task = {
+            name: value
+            for name in ("plan", "goal_radius")
+            if (value := getattr(options, name)) is not None
+        }
+        TaskConfig(**options.loaded.env_arguments | options.task)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -211,6 +226,7 @@ def output_folder(options: argparse.Namespace) -> Path:
         latency=options.latency,
         filtered=options.filter,
         robot=options.robot if options.policy is None else None,
+        task=options.task,
     )
     policy = options.path
     if policy is None:
@@ -320,7 +336,7 @@ def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> It
 def described(options: argparse.Namespace, asked: dict[str, Any]) -> dict[str, Any]:
     """What an evaluation was of, for the file of its settings."""
     policy = options.loaded
-    document: dict[str, Any] = {"words": options.worlds, **asked}
+    document: dict[str, Any] = {"words": options.worlds, **asked, **options.task}
     if options.filter:
         document["filter"] = {"clearance": CLEARANCE}
     if options.noise is not None:
@@ -364,11 +380,12 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     physics = options.physics
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
     errors = {"noise": options.noise, "latency": options.latency}
-    how = {**errors, "physics": physics}
+    how = {**errors, "physics": physics, **options.task}
     if options.live:
         return show_live(driver, options, how)
     with held(folder):
-        driven = drive(driver, options.names, **errors, progress=not options.no_pictures, **asked)
+        asked_for = {**errors, **asked, **options.task}
+        driven = drive(driver, options.names, progress=not options.no_pictures, **asked_for)
         results = [result for drives in driven for result in drives.results]
         rows = [
             {"world": world_name(world), "physics": physics, **summary_row(drives.results)}

@@ -37,6 +37,11 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     # Only where it is not the default: policies are asked for no argument that they do not need.
     view = settings.field_of_view
     seen = {} if view in (None, robot.field_of_view) else {"lidar": lidar_arguments(view)}
+    given = {
+        name: value
+        for name in ("plan", "goal_radius")
+        if (value := getattr(settings, name)) != getattr(TaskConfig, name)
+    }
     return {
         "robot": robot,
         "physics": settings.physics,
@@ -46,9 +51,10 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "memory": settings.memory,
         "history": settings.history,
         **seen,
+        **given,
         # The lidar saturates where the training ends an episode, and shows all distances above; a
         # robot that can stop may drive on from there, and must know how near it is.
-        "closeness_distance": robot.radius + (0.0 if robot.can_stop else settings.clearance),
+        "closeness_distance": robot.lidar_to_rim + (0.0 if robot.can_stop else settings.clearance),
     }
 
 

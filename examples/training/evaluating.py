@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from itertools import accumulate
+from types import MappingProxyType
 from typing import Any
 
 from mpfa_envs import (
@@ -65,6 +66,7 @@ def evaluation_folder(
     latency: float | None = None,
     filtered: bool = False,
     robot: RobotModel | None = None,
+    task: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
     """Name of the folder of an evaluation: each choice has its own.
 
@@ -78,6 +80,7 @@ def evaluation_folder(
             f"evaluation-{worlds_label(words)}-{physics}",
             "-filter" if filtered else "",
             f"-{robot.name}" if robot is not None else "",
+            *(f"-{name}-{value}" for name, value in task.items()),
             f"-seed{seed}" if seed else "",
             *(f"-{what}{value:g}" for what, value in errors.items() if value),
         ]
@@ -101,7 +104,7 @@ def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
     robot, known = resolve_robot(robot), TaskConfig(**policy.env_arguments)
     moved = copy(policy)
     # The lidar saturates as far from the rim as it did.
-    near = known.closeness_distance - known.robot.radius + robot.radius
+    near = known.closeness_distance - known.robot.lidar_to_rim + robot.lidar_to_rim
     changes = {"robot": asdict(robot), "closeness_distance": round(near, 9)}
     moved.env_arguments = {**policy.env_arguments, **changes}
     parts = TaskConfig(**moved.env_arguments).observation_slices
@@ -151,13 +154,15 @@ def drive(
     noise: RobotNoise | None = None,
     latency: float | None = None,
     progress: bool,
+    **task: Any,
 ) -> list[Drives]:
     """Drive a policy through fixed tasks of each world, as :func:`mpfa_envs.evaluate`.
 
-    Contact is the only collision. Return tasks, results and paths of each world; these do not
-    depend on the other worlds.
+    Contact is the only collision, and ``task`` has further arguments. Return tasks, results and
+    paths of each world; these do not depend on the other worlds.
     """
     arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise, "latency": latency}
+    arguments |= task
     if physics is not None:
         arguments["physics"] = physics
     sets = [tasks_of(policy, [each], episodes=episodes, seed=seed) for each in worlds]

@@ -10,12 +10,23 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from mpfa_envs import Box, Lidar, NavigationEnv, VectorNavigationEnv, World, generate_world
+from mpfa_envs import (
+    Box,
+    GoalRelabeling,
+    Lidar,
+    NavigationEnv,
+    TaskConfig,
+    VectorNavigationEnv,
+    World,
+    generate_world,
+)
+from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
+from mpfa_envs.worlds.occupancy import OccupancyGrid
 from tests.envs.paper import drive_to_end
 from tests.envs.shapes import random_shapes
 
@@ -235,3 +246,55 @@ def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     orange = (env.render() == PATH[:3]).all(axis=-1)
     assert 50 < orange.sum() < 5000
     env.close()
+
+
+@pytest.mark.parametrize("world", ["D", "mazes-3", "map"])
+def test_a_plan_gives_cells_the_levels_that_hits_all_over_would_give(world: str) -> None:
+    if world == "map":
+        cells = np.zeros((120, 80), np.bool_)
+        cells[60, 20:] = cells[20:40, 30] = True
+        grid = OccupancyGrid(cells, 0.1)
+        room = World(name="map", size=grid.size, occupancy=grid)
+    else:
+        room = resolve_world(world)
+    robot = ROBOTS["kobuki"]
+    memory = MapMemory(2, robot, lidar := Lidar(room, sectors=720, field_of_view=360.0))
+    memory.begin(0, room, plan=room)
+    memory.begin(1, room)
+    rng = np.random.default_rng(0)
+    goals = np.zeros((2, 2))
+    only = np.array([False, True])
+    for _ in range(400):
+        x, y = rng.uniform(-0.5, 0.5, 2) * room.size
+        if room.clearance(x, y) > 0.05:
+            ranges = np.tile(lidar.cast(x, y, 0.0), (2, 1))
+            memory.remember(np.tile([x, y, 0.0, 0.0, 0.0], (2, 1)), goals, ranges, only)
+    # All that was hit is known; inside of obstacles nothing is hit.
+    columns, rows = memory.arrays.shapes[0]
+    known, hit = memory.arrays.levels[:, :columns, :rows]
+    assert (known >= hit).all()
+    places = np.indices(known.shape).reshape(2, -1).T * 0.1 + memory.arrays.origins[0]
+    free = (room.clearances(places) > 0.03).reshape(known.shape)
+    assert (known[free] == hit[free]).mean() > 0.97
+
+
+def test_with_a_plan_the_path_is_known_before_anything_is_seen() -> None:
+    wall = World(name="wall", size=(12.0, 8.0), boxes=(Box(1.0, -4.0, 1.2, 2.5),))
+    ways = {}
+    for plan in ("unknown", "known"):
+        robot = {"robot": "kobuki", "memory": "map", "plan": plan, "physics": "kinematic"}
+        env = NavigationEnv(world=wall, lidar={"max_range": 2.0}, **robot)
+        seen, _ = env.reset(options={"start": (-3.0, -2.0, 0.0), "goal": (4.0, -2.0)})
+        ways[plan] = seen[env.config.observation_slices["way_length"]][0]
+        env.close()
+    assert ways["unknown"] == pytest.approx(0.7, abs=0.02)
+    assert ways["known"] > 1.1
+
+
+def test_a_plan_needs_a_map() -> None:
+    with pytest.raises(ValueError, match="plan must be 'unknown' without a map"):
+        TaskConfig(plan="known")
+    with pytest.raises(ValueError, match="plan must be"):
+        TaskConfig(memory="map", plan="some")
+    with pytest.raises(ValueError, match="plan must be 'unknown' with goals in hindsight"):
+        GoalRelabeling(TaskConfig(memory="map", plan="known", progress="none"))

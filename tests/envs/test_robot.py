@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pybullet
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.speed.bullet_world import BulletWorld
 from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, RobotModel, World
-from mpfa_envs.robots.drives import WheelDrives
+from mpfa_envs.robots.drives import KinematicDrives, WheelDrives
 
 
 class Wheels:
@@ -73,6 +75,57 @@ def test_a_robot_turns_no_faster_than_its_limit(name: str, fastest: float) -> No
         assert (right - left) / robot.wheel_base == pytest.approx(action[1] * fastest)
         assert left + right == pytest.approx(0.0)
     assert robot.max_angular_speed == pytest.approx(fastest)
+
+
+def driven_from(
+    robot: RobotModel, start: tuple[float, float], wanted: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Forward and turning speeds of the first second on the way to other wheel speeds."""
+    drives = KinematicDrives(robot, 1, time_step=0.02)
+    drives.commands[0] = start
+    motions, speeds = np.zeros((1, 5)), []
+    for _ in range(50):
+        drives.move(motions, np.ones(1, dtype=np.bool_), np.array([wanted]))
+        speeds.append(motions[0, 3:].copy())
+    return np.array(speeds)
+
+
+@pytest.mark.parametrize(
+    ("start", "wanted"), [((0.0, 0.0), (-0.7, 0.7)), ((0.5, 0.5), (0.0, 0.0)), ((0.7, 0.1), (0, 0))]
+)
+def test_a_robot_turns_and_brakes_no_faster_than_its_controller_allows(
+    start: tuple[float, float], wanted: tuple[float, float]
+) -> None:
+    limits = {"deceleration": 0.5, "turn_acceleration": 2.0}
+    robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, **limits)
+    speeds = driven_from(robot, start, wanted)
+    assert np.abs(np.diff(speeds[:, 0])).max() <= 0.5 * 0.02 + 1e-9
+    assert np.abs(np.diff(speeds[:, 1])).max() <= 2.0 * 0.02 + 1e-9
+    aim = speeds[-1] - np.array([sum(wanted) / 2, (wanted[1] - wanted[0]) / robot.wheel_base])
+    before = speeds[0] - np.array([sum(wanted) / 2, (wanted[1] - wanted[0]) / robot.wheel_base])
+    assert np.abs(aim).sum() < np.abs(before).sum()
+
+
+def test_a_robot_with_a_limited_turn_begins_to_turn_while_it_drives_off() -> None:
+    robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, turn_acceleration=4.0)
+    speeds = driven_from(robot, (0.0, 0.0), (-0.1, 0.7))
+    assert speeds[4, 1] == pytest.approx(5 * 4.0 * 0.02)
+    assert speeds[-1] == pytest.approx((0.3, math.pi))
+
+
+@pytest.mark.parametrize(
+    ("action", "forward", "turn"),
+    [((-1, -1), 0.0, 0.0), ((-1, 0), 0.0, 1.75), ((-1, 1), 0.2, 3.5), ((0, 1), 0.55, 1.75)],
+)
+def test_a_body_that_does_not_reverse_turns_on_the_spot(
+    action: tuple[float, float], forward: float, turn: float
+) -> None:
+    cart = replace(ROBOTS["waffle"], wheel_base=0.4, min_wheel_speed=-0.5, max_wheel_speed=0.9)
+    cart = replace(cart, turn_limit=None, reverse=False)
+    left, right = cart.wheel_speeds(np.array(action, dtype=np.float32))
+    assert (left + right) / 2 == pytest.approx(forward)
+    assert (right - left) / 0.4 == pytest.approx(turn)
+    assert -0.5 <= min(left, right) <= max(left, right) <= 0.9
 
 
 def test_the_casters_slide_and_the_wheels_hold() -> None:

@@ -31,7 +31,7 @@ from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 
 CART = load_robot(EXAMPLE_ROBOT)
-UNIT = re.compile(r"\[(?:[^\[\]]*\b)?(m|kg|deg|s|m/s|m/s²|rad/s|m, m, rad)\]$")
+UNIT = re.compile(r"\[(?:[^\[\]]*\b)?(m|kg|deg|s|m/s|m/s²|rad/s|rad/s²|m, m, rad)\]$")
 
 
 def changed(line: str) -> str:
@@ -59,7 +59,11 @@ def test_the_example_has_each_field_and_its_unit() -> None:
         key, _, rest = line.partition(":")
         keys[key] = UNIT.search(rest) is not None
     assert list(keys) == [field.name for field in fields(RobotModel)]
-    assert [key for key, has_unit in keys.items() if not has_unit] == ["name", "lidar_rays"]
+    assert [key for key, has_unit in keys.items() if not has_unit] == [
+        "name",
+        "reverse",
+        "lidar_rays",
+    ]
 
 
 @pytest.mark.parametrize("robot", [*ROBOTS.values(), CART])
@@ -78,6 +82,8 @@ def test_a_robot_comes_back_from_its_file_and_its_fields(robot: RobotModel, tmp_
         ("radius: -1", "radius must be positive, got -1.0"),
         ("mass: heavy", "mass must be a number in kg, got 'heavy'"),
         ("turn_limit: null", "turn_limit must be a number in rad/s, got 'null'"),
+        ("turn_acceleration: 0", "turn_acceleration must be positive, got 0.0"),
+        ("reverse: never", "reverse must be true or false, got 'never'"),
         ("wheel_base: 0.9", "wheel_base must be at most the diameter 0.56, got 0.9"),
         ("min_wheel_speed: 2", "min_wheel_speed must be below max_wheel_speed = 0.9, got 2.0"),
         ("field_of_view: 400", "field_of_view must be at most 360 deg in size, got 400"),

@@ -20,6 +20,8 @@ from mpfa_envs import (
     evaluate,
 )
 from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.sensing.lidar import ray_angles
 
 AROUND = {"field_of_view": 360.0, "sectors": 36}
 STANDING = [name for name in GENERATORS if name not in ("crowd", "mixed")]
@@ -61,7 +63,7 @@ def drive_at_random(
     latency: Any = None,
 ) -> float:
     """Least clearance of robots that hold a random action for a while [m]."""
-    near = ROBOTS[robot].radius if isinstance(robot, str) else robot.radius
+    near = resolve_robot(robot).lidar_to_rim
     arguments = {"robot": robot, "physics": physics, "closeness_distance": near, "max_steps": 400}
     arguments |= {"contact": True, "latency": latency}
     arguments["lidar"] = {"field_of_view": view, "sectors": round(view / 10.0)}
@@ -85,7 +87,48 @@ def test_a_random_policy_touches_nothing(robot: str, world: str) -> None:
     assert drive_at_random(robot, world, 2_000, physics="kinematic", robots=20) > 0.0
 
 
-@pytest.mark.parametrize("view", [90.0, 180.0, 270.0])
+@pytest.mark.parametrize("view", [60.0, 90.0, 150.0, 170.0])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.12, 0.0, 0.0), (-0.1, 0.05, 0.0)])
+def test_a_view_beside_which_it_would_never_drive_is_rejected(
+    view: float, place: tuple[float, ...]
+) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=view, lidar_mount=place)
+    with pytest.raises(ValueError, match=f"at least 180 degrees for a filter.* got {view:.0f}"):
+        TaskConfig(robot=robot).make_filter()
+    TaskConfig(robot=replace(ROBOTS["turtlebot2"], field_of_view=view)).make_filter()
+
+
+@pytest.mark.parametrize("view", [180.0, 240.0, 360.0])
+@pytest.mark.parametrize("place", [(0.12, 0.0), (-0.1, 0.0), (0.06, 0.1)])
+@pytest.mark.parametrize("world", ["mazes", "rooms"])
+def test_a_random_policy_touches_nothing_wherever_its_lidar_is(
+    world: str, place: tuple[float, float], view: float
+) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=view, lidar_mount=(*place, 0.0))
+    arguments = {"physics": "kinematic", "robots": 20, "view": view}
+    assert drive_at_random(robot, world, 2_000, **arguments) > 0.0
+
+
+@pytest.mark.parametrize("turning", [0.5, 2.0])
+@pytest.mark.parametrize("reverse", [True, False])
+def test_a_random_policy_touches_nothing_whatever_the_controller(
+    turning: float, reverse: bool
+) -> None:
+    limits = {"deceleration": 0.5, "turn_acceleration": turning, "reverse": reverse}
+    robot = replace(ROBOTS["kobuki"], **limits)
+    assert drive_at_random(robot, "rooms", 3_000, physics="kinematic", robots=20) > 0.0
+
+
+@pytest.mark.parametrize("view", [180.0, 240.0])
+@pytest.mark.parametrize("x", [0.12, 0.0, -0.1])
+def test_a_robot_drives_in_a_hall_wherever_its_lidar_is(x: float, view: float) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=view, lidar_mount=(x, 0.0, 0.0))
+    keep = TaskConfig(robot=robot).make_filter()
+    ahead = np.ones(2, np.float32)
+    assert keep(observed(TaskConfig(robot=robot), 10.0), ahead).tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("view", [180.0, 270.0])
 @pytest.mark.parametrize("world", ["mazes", "rooms"])
 def test_a_random_policy_does_not_drive_into_what_it_does_not_see(world: str, view: float) -> None:
     arguments = {"physics": "kinematic", "robots": 20, "view": view}
@@ -307,7 +350,8 @@ def test_sixty_four_robots_take_less_than_a_millisecond() -> None:
     ],
 )
 def test_an_argument_out_of_range_is_rejected(change: dict[str, Any], message: str) -> None:
-    arguments = {"robot": "kobuki", "angles": np.zeros(36), "sectors": 36, "max_range": 10.0}
+    angles = ray_angles(360.0, 36)
+    arguments = {"robot": "kobuki", "angles": angles, "sectors": 36, "max_range": 10.0}
     with pytest.raises(ValueError, match=message):
         SafetyFilter(**{**arguments, "closeness_distance": 0.2, **change})
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
 
+from mpfa_envs import ROBOTS, Box, Lidar, RobotModel, World
 from mpfa_envs.deploy import Scan, ScanError, Sectors
+from mpfa_envs.env.config import lidar_arguments
+from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from tests.envs.exported import card
 
 
@@ -261,7 +265,7 @@ def test_a_scan_that_says_nothing_is_rejected(scan: Scan, message: str, silent: 
         Sectors(card(), silent=silent).read(scan)
 
 
-ROOM = np.linspace(0.3, 7.9, 360)
+RANGES = np.linspace(0.3, 7.9, 360)
 """Ranges of a room [m]."""
 
 
@@ -271,7 +275,7 @@ ROOM = np.linspace(0.3, 7.9, 360)
 def test_a_scan_in_another_unit_is_rejected(
     scale: float, limits: tuple[float, float], scales: tuple[float, float]
 ) -> None:
-    ranges, end = scale ** scales[0] * ROOM, scale ** scales[1] * limits[1]
+    ranges, end = scale ** scales[0] * RANGES, scale ** scales[1] * limits[1]
     scan = Scan(-math.pi, math.pi / 180, ranges, limits[0], end)
     if scales[0] == 0.0 and math.isinf(end):
         Sectors(card()).read(scan)  # Nothing of it is in another unit.
@@ -285,12 +289,63 @@ def test_a_scan_in_another_unit_is_rejected(
     [
         (np.full(360, 65535.0), 25.0),
         (np.full(360, math.inf), math.inf),
-        (np.where(ROOM > 4.0, 65535.0, ROOM), 25.0),
-        (30.0 + ROOM, 100.0),
-        (ROOM, float(np.finfo(np.float32).max)),
+        (np.where(RANGES > 4.0, 65535.0, RANGES), 25.0),
+        (30.0 + RANGES, 100.0),
+        (RANGES, float(np.finfo(np.float32).max)),
     ],
 )
 def test_a_scan_of_a_wide_hall_or_with_a_number_for_nothing_is_read(
     ranges: np.ndarray, end: float
 ) -> None:
     Sectors(card()).read(Scan(-math.pi, math.pi / 180, ranges, 0.1, end))
+
+
+ROOM = World(name="room", size=(5.0, 3.5), boxes=(Box(0.6, -0.5, 0.9, 0.3),))
+
+
+def seen_by(robot: RobotModel, pose: tuple[float, float, float]) -> Scan:
+    """An exact scan of a robot's lidar in the room, four rays a degree."""
+    half = math.radians(robot.field_of_view / 2)
+    count = round(4 * robot.field_of_view)
+    step = 2 * half / count
+    simulated = SimulatedRobot(
+        ROOM, robot=robot, physics="kinematic", rays=count, field=(step / 2 - half, half - step / 2)
+    )
+    simulated.place(pose)
+    return simulated.scan()
+
+
+@pytest.mark.parametrize("view", [180.0, 240.0, 360.0])
+@pytest.mark.parametrize("mount", [(0.12, 0.0, 0.0), (-0.1, 0.04, 0.0), (0.12, 0.0, 0.0, math.pi)])
+@pytest.mark.parametrize("pose", [(0.0, -1.3, 0.0), (-2.2, 0.3, 2.0), (0.1, 0.0, 1.2)])
+def test_a_pilot_reads_what_the_training_senses_wherever_the_lidar_is(
+    pose: tuple[float, float, float], mount: tuple[float, ...], view: float
+) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=view, lidar_mount=mount)
+    lidar = Lidar(ROOM, **lidar_arguments(view), rays_per_sector=40, mount=mount[:2])
+    facts = card(robot=robot, sectors=lidar.sectors, field_of_view=view)
+    sectors = Sectors(facts, mount=mount)
+    ranges, points = sectors.read(seen_by(robot, pose))
+    np.testing.assert_allclose(ranges, lidar.scan(*pose), atol=0.02)
+    # Points are around the center, on a wall or the box.
+    x = pose[0] + points.ranges * np.cos(points.angles + pose[2])
+    y = pose[1] + points.ranges * np.sin(points.angles + pose[2])
+    assert np.abs(ROOM.clearances(np.stack((x, y), axis=1))).max() < 1e-6
+
+
+@pytest.mark.parametrize("view", [180, 240, 270])
+@pytest.mark.parametrize("x", [0.0, 0.1, -0.1])
+@pytest.mark.parametrize("silent", ["reject", "far"])
+def test_what_lies_beyond_the_last_ray_is_not_seen(x: float, view: int, silent: str) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=float(view), lidar_mount=(x, 0.0, 0.0))
+    facts = card(robot=ROBOTS["kobuki"], sectors=36, field_of_view=360.0)
+    scan = seen_by(robot, (0.0, -1.3, 0.4))
+    sectors = Sectors(facts, mount=robot.lidar_mount, unseen=0.3, silent=silent)
+    ranges, _ = sectors.read(scan)
+    _, hidden = sectors.blind(scan)
+    rear = ranges[[0, 1, 2, -3, -2, -1]]
+    assert rear.tolist() == [0.3] * 6
+    assert hidden[[0, 1, 2, -3, -2, -1]].all()
+    assert ranges.max() < 6.0
+    with pytest.raises(ScanError, match="does not reach the sector at 175 degrees"):
+        Sectors(facts, mount=robot.lidar_mount, silent=silent).read(scan)

@@ -314,6 +314,25 @@ def test_the_policy_that_comes_with_the_project_reaches_its_goals(
     assert (tmp_path / "runs/evaluation-td3-paper/evaluation-A-kinematic/episodes.csv").exists()
 
 
+def test_a_plan_and_a_goal_radius_shorten_and_lengthen_the_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--worlds", "mazes:validation", "--episodes", "12", "--no-pictures"]
+    times, name = {}, "td3-rooms"
+    for words in ([], ["--plan", "known"], ["--goal-radius", "0.2"]):
+        summary = evaluate.main([name, *arguments, *words])
+        assert summary["success"].iloc[0] == 1.0
+        times["".join(words)] = summary["time_s"].iloc[0]
+    assert times["--planknown"] < times[""] < times["--goal-radius0.2"]
+    folders = (tmp_path / "runs" / "evaluation-td3-rooms").iterdir()
+    middles = {each.name.removeprefix("evaluation-mazes-validation-kinematic") for each in folders}
+    assert middles == {"-filter", "-filter-plan-known", "-filter-goal_radius-0.2"}
+    with pytest.raises(SystemExit):
+        evaluate.parse(["--policy", "astar", "--plan", "known"])
+    assert "plan must be 'unknown' without a map" in capsys.readouterr().err
+
+
 def test_worlds_and_their_label_agree() -> None:
     assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
     tests = [f"{name}:test" for name in GENERATORS if name not in ("mixed", "crowd")]

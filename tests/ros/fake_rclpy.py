@@ -92,12 +92,14 @@ def install(patch: pytest.MonkeyPatch, world: World) -> Any:
         try_shutdown=lambda: None,
     )
     module("rclpy.node", Node=_node(world))
-    module("rclpy.qos", qos_profile_sensor_data=None)
+    durability = SimpleNamespace(TRANSIENT_LOCAL=1)
+    qos = {"DurabilityPolicy": durability, "QoSProfile": SimpleNamespace}
+    module("rclpy.qos", qos_profile_sensor_data=None, **qos)
     module("rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO=0))
     module("rclpy.time", Time=lambda: None)
     for package, names in {
         "geometry_msgs": ("PoseStamped", "TwistStamped"),
-        "nav_msgs": ("Odometry",),
+        "nav_msgs": ("OccupancyGrid", "Odometry"),
         "sensor_msgs": ("LaserScan",),
     }.items():
         module(package)

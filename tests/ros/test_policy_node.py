@@ -60,7 +60,9 @@ def scan(time: float) -> Any:
 
 
 def goal(frame: str, x: float = 4.0) -> Any:
-    return names(header=names(frame_id=frame), pose=names(position=names(x=x, y=0.0)))
+    facing = names(x=0.0, y=0.0, z=math.sin(0.5), w=math.cos(0.5))
+    pose = names(position=names(x=x, y=0.0), orientation=facing)
+    return names(header=names(frame_id=frame), pose=pose)
 
 
 def transform(time: float, x: float = 0.0) -> Any:
@@ -245,3 +247,68 @@ def test_an_abandoned_goal_is_not_taken_up_again(module: Any, world: World) -> N
     world.now = 10.1
     node._tick()
     assert node.controller.pilot.goal is None
+
+
+def turning_robot(tmp_path: Path, **arguments: Any) -> str:
+    """The file of a policy of a Kobuki that wants to drive straight ahead."""
+    size = 45 if arguments else 42
+    layer = Linear(np.zeros((2, size), np.float32), np.ones(2, np.float32))
+    policy = Policy([layer], env_arguments={"robot": "kobuki", **arguments})
+    return str(export_policy(policy, tmp_path / "turns.onnx"))
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_it_turns_to_the_heading_of_the_goal(
+    module: Any, world: World, tmp_path: Path, asked: bool
+) -> None:
+    world.parameters |= {"policy": turning_robot(tmp_path), "goal_heading": asked}
+    node = module.PolicyNode()
+    node._on_odometry(odometry(10.0))
+    node._on_goal(goal("odom", x=0.1))
+    still = odometry(10.1)
+    still.twist.twist.linear.x = 0.0
+    world.now = 10.1
+    node._on_odometry(still)
+    node._on_scan(scan(10.1))
+    linear, angular = world.sent[-1]
+    assert linear == 0.0 and (angular > 0.0) == asked
+    assert (node.controller.pilot.goal is None) != asked
+
+
+def occupancy(frame: str, wall: int) -> Any:
+    """A map of 8 x 6 m with a wall across, 4 m before its left edge, of cells with a chance."""
+    cells = np.full((60, 80), -1)
+    cells[:, 40] = wall
+    cells[30, 40] = 0
+    place = names(position=names(x=-2.0, y=-3.0), orientation=names(x=0.0, y=0.0, z=0.0, w=1.0))
+    info = names(width=80, height=60, resolution=0.1, origin=place)
+    return names(header=names(frame_id=frame), info=info, data=cells.ravel().tolist())
+
+
+@pytest.mark.parametrize("wall", [100, 40])
+def test_it_knows_the_map_of_the_topic_where_localization_has_it(
+    module: Any, world: World, tmp_path: Path, wall: int
+) -> None:
+    world.parameters |= {"policy": turning_robot(tmp_path, memory="map"), "map_topic": "map"}
+    node = module.PolicyNode()
+    node._on_map(occupancy("map", wall))
+    world.transform = transform(10.0, x=1.0)
+    node._on_odometry(odometry(10.0))
+    node._on_goal(goal("odom"))
+    feed(node, world, 10.0)
+    pilot = node.controller.pilot
+    assert pilot.plan is node._plan[0]
+    # In the frame of the odometry the wall is at 3 m.
+    origin, levels = pilot._map._memory.arrays.origins[0], pilot._map._memory.arrays.levels[0]
+    column = round((3.05 - pilot._map._center[0] - origin[0]) / 0.1)
+    blocked = (levels[column, 10:50] == 3).mean()
+    assert blocked == 1.0 if wall == 100 else blocked < 0.3
+    world.transform = transform(10.2, x=1.5)
+    feed(node, world, 10.2)
+    assert pilot._plan.pose == pytest.approx((-0.5, -3.0, 0.0))
+
+
+def test_a_map_needs_a_policy_that_has_one(module: Any, world: World) -> None:
+    world.parameters["map_topic"] = "map"
+    with pytest.raises(ValueError, match="map_topic must be '' for a policy without a map"):
+        module.PolicyNode()

@@ -2,42 +2,82 @@
 
 from __future__ import annotations
 
+import math
 from importlib import import_module
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mpfa_envs.deploy.sectors import Points
 from mpfa_envs.sensing.map_loops import UNKNOWN
-from mpfa_envs.sensing.map_memory import MapMemory
+from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
+    from mpfa_envs.worlds.world import World
+
+
+class Plan(NamedTuple):
+    """A plan that a robot knows, and where it lies."""
+
+    world: World
+    pose: tuple[float, float, float]
+    """Of the plan's frame in that of the odometry (x, y, heading) [m, m, rad]."""
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Middle of the room in the frame of the odometry (x, y) [m]."""
+        x, y, heading = self.pose
+        # A map of ROS has an origin of its own.
+        cells = self.world.occupancy
+        across, up = (0.0, 0.0) if cells is None else cells.center
+        cosine, sine = math.cos(heading), math.sin(heading)
+        return x + across * cosine - up * sine, y + across * sine + up * cosine
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Sides of the smallest room along the axes of the odometry that holds it [m]."""
+        width, depth = self.world.size
+        cosine, sine = abs(math.cos(self.pose[2])), abs(math.sin(self.pose[2]))
+        return width * cosine + depth * sine, width * sine + depth * cosine
+
+    def is_off(self, pose: tuple[float, float, float]) -> bool:
+        """Return True if from another pose a wall of the plan would be in another cell."""
+        reach = 0.5 * math.hypot(*self.world.size)
+        turn = abs(math.remainder(pose[2] - self.pose[2], math.tau))
+        return math.dist(self._replace(pose=pose).middle, self.middle) + reach * turn > RESOLUTION
 
 
 class MapPath:
-    """A square map around a place, of a side [m], and the path over it to the goal."""
+    """A map around a place, and the path over it to the goal."""
 
-    def __init__(self, card: Card, *, size: float) -> None:
+    def __init__(self, card: Card) -> None:
         # Without Numba the loops would run, but a thousand times more slowly.
         import_module("numba")
         # The rays come with each scan, and of the room only the size is known.
-        lidar: Any = SimpleNamespace(angles=np.zeros(1), max_range=card.max_range)
+        rays = {"angles": np.zeros(1), "mount": (0.0, 0.0)}
+        lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
-        self._room: Any = SimpleNamespace(size=(size, size))
         self._center = np.zeros(2)
         # The loops are compiled by their first call, which takes seconds.
-        self.begin((0.0, 0.0))
+        self.begin((0.0, 0.0), (10.0, 10.0))
         here = np.zeros(3)
         self.sense(here, here, (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
-    def begin(self, center: tuple[float, float]) -> None:
-        """Begin an empty map around a place [m]."""
+    def begin(
+        self, center: tuple[float, float], size: tuple[float, float], plan: Plan | None = None
+    ) -> None:
+        """Begin a map of a size around a place [m], empty or with what a plan knows."""
         self._center[:] = center
-        self._memory.begin(0, self._room)
+        room: Any = SimpleNamespace(size=size)
+        if plan is None:
+            self._memory.begin(0, room)
+        else:
+            x, y = np.subtract(plan.middle, center).tolist()
+            self._memory.begin(0, room, plan=plan.world, pose=(x, y, plan.pose[2]))
 
     def look_again(self) -> None:
         """The goal has moved: no path to it is known."""

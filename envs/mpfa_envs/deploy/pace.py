@@ -36,7 +36,16 @@ def fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
     pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
     if robot.turn_limit is not None:
         pace = min(pace, robot.turn_limit / learned.max_angular_speed)
-    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
-        needed = learned.wheel_acceleration * widening(robot, learned)
-        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
+    changes = learned.wheel_limits.acceleration * widening(robot, learned)
+    for can, does in (
+        (robot.wheel_limits.acceleration, changes),
+        (turning(robot), turning(learned)),
+    ):
+        if math.isfinite(can) and math.isfinite(does):
+            pace = min(pace, math.sqrt(can / does))
     return pace
+
+
+def turning(robot: RobotModel) -> float:
+    """Fastest change of its turn by the controller [rad/s²]."""
+    return math.inf if robot.turn_acceleration is None else robot.turn_acceleration

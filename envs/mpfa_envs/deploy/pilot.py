@@ -8,17 +8,24 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import MEANT, check_not_negative, check_positive, check_share
+from mpfa_envs.checks import (
+    MEANT,
+    check_not_negative,
+    check_number,
+    check_positive,
+    check_share,
+)
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
-from mpfa_envs.deploy.pace import fastest_pace, tolerance, wheel_range, widening
+from mpfa_envs.deploy.pace import fastest_pace, tolerance, turning, wheel_range, widening
 from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
 from mpfa_envs.deploy.way_back import WayBack
+from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.orders import STRENGTH, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.lidar import ray_angles
-from mpfa_envs.sensing.observation_loops import look_from, observe_all
+from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
 
 if TYPE_CHECKING:
     import os
@@ -26,7 +33,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.deploy.map_path import MapPath
+    from mpfa_envs.deploy.map_path import MapPath, Plan
+    from mpfa_envs.worlds.world import World
 
 _WIDER: Final = 0.01
 """A robot's radius may exceed that in training by this [m]."""
@@ -36,6 +44,14 @@ _PARTS: Final = 5
 """Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
+_BESIDE: Final = 0.01
+"""Cosine above which a direction is ahead."""
+_FACING: Final = math.radians(5.0)
+"""Error of the heading at a goal [rad]."""
+_STANDS: Final = 0.03
+"""Speed below which a robot stands, and may turn at the goal [m/s]."""
+_LAST: Final = 0.02
+"""Distance from the goal below which the robot drives no more slowly [m]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
@@ -79,13 +95,16 @@ class Pilot:
         unseen: As there.
         silent: As there.
         map_size: Side of the map of a policy that has one [m], a square around the robot's first
-            position; the path leads through it alone.
+            position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot drives the orders under way first, and
             decides for the state that it comes to; its filter allows for an error of 0.05 s, and
             for wheels that are slower by a fifth.
+        goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
+            Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
+            where it arrives.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -106,6 +125,7 @@ class Pilot:
         map_size: float = 40.0,
         clearance: float | None = None,
         latency: float | None = None,
+        goal_radius: float | None = None,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -137,12 +157,17 @@ class Pilot:
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)
+        self.goal_radius = card.goal_radius
+        if goal_radius is not None:
+            self.goal_radius = check_positive("goal_radius", goal_radius)
+        self._heading: float | None = None
+        self._there = False
         self._map: MapPath | None = None
         if card.memory == "map":
             # Imported here because it needs Numba, and compiled before the first decision is due.
             from mpfa_envs.deploy.map_path import MapPath
 
-            self._map = MapPath(card, size=self._map_size)
+            self._map = MapPath(card)
         if clearance is not None and not learned.can_stop:
             raise ValueError(
                 f"clearance must be None for a policy of {learned.name}, whose wheels turn at "
@@ -152,6 +177,8 @@ class Pilot:
         self._keep = None if clearance is None else self._filter(clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
+        self._plan: Plan | None = None
+        self._fresh_map = False
         self._fresh = True
         self._way_back = WayBack(learned, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
@@ -191,34 +218,75 @@ class Pilot:
         """The goal (x, y) [m]; None without."""
         return self._goal
 
+    @property
+    def plan(self) -> World | None:
+        """The building that :meth:`begin` was given; None without, and without a goal."""
+        return None if self._plan is None or self._goal is None else self._plan.world
+
+    @property
+    def turns_on_the_spot(self) -> bool:
+        """True if the robot can turn on the spot, as a heading at the goal needs."""
+        return self._spot_speed() > 0.0
+
     def begin(
-        self, goal: tuple[float, float], *, map_center: tuple[float, float] | None = None
+        self,
+        goal: tuple[float, float],
+        *,
+        map_center: tuple[float, float] | None = None,
+        plan: World | None = None,
+        plan_pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        heading: float | None = None,
     ) -> None:
-        """Set out for a goal with an empty memory.
+        """Set out for a goal with an empty memory, or with a plan.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
             map_center: Center of the map of a policy that has one (x, y) [m]; None: where the robot
                 is at its first decision.
+            plan: The building, for a policy with a map, which then begins with its walls; scans
+                add what the plan does not have. None: the map begins empty.
+            plan_pose: Of the plan's frame, that of its coordinates or of its ROS map, in the frame
+                of the odometry (x, y, heading) [m, m, rad].
+            heading: Direction to which the robot turns on the spot at the goal, in the frame of the
+                odometry [rad]; None: any.
 
         Raises:
-            ValueError: If a number is not finite or beyond 1e7 m, or the goal is not on the map.
+            ValueError: If a number is not finite or beyond 1e7 m, the goal is not on the map, there
+                is a plan without a map or with a center, or a heading for a robot that cannot turn
+                on the spot.
         """
+        if heading is not None and not self.turns_on_the_spot:
+            raise ValueError(
+                f"heading must be None for {self.robot.name}, which cannot turn on the spot "
+                f"(min_wheel_speed = {self.robot.min_wheel_speed}), got {heading}"
+            )
         center = None if map_center is None else _pair("map_center", map_center)
         goal = _pair("goal", goal)
-        self._check_on_map(goal, center)
-        self._goal, self._center, self._fresh = goal, center, True
+        placed = None
+        if plan is not None:
+            if self._map is None or center is not None:
+                raise ValueError(
+                    "plan must be None for a policy without a map (memory='map'), and with a "
+                    f"map_center, got {plan.name!r}"
+                )
+            placed = _placed(plan, plan_pose)
+            center = placed.middle
+        self._check_on_map(goal, center, placed)
+        self._heading = None if heading is None else check_number("heading", heading)
+        self._goal, self._center, self._plan, self._fresh = goal, center, placed, True
+        self._there = False
         self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
         """Give up the goal."""
         self._goal = None
 
-    def move_goal(self, goal: tuple[float, float]) -> None:
+    def move_goal(self, goal: tuple[float, float], *, heading: float | None = None) -> None:
         """Correct the goal while driving; the map is kept.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
+            heading: As for :meth:`begin`; None: as it was.
 
         Raises:
             ValueError: If it is not finite, beyond 1e7 m or not on the map, or the robot has not
@@ -226,15 +294,42 @@ class Pilot:
         """
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
+        if heading is not None and self._heading is not None:
+            self._heading = check_number("heading", heading)
         if (goal := _pair("goal", goal)) != self._goal:
-            self._check_on_map(goal, self._center)
+            self._check_on_map(goal, self._center, self._plan)
             self._goal = goal
             if self._map is not None:
                 self._map.look_again()
 
+    def move_plan(self, pose: tuple[float, float, float]) -> None:
+        """Correct the pose of the plan while driving, as localization does.
+
+        Where walls would be in other cells, the map begins again.
+
+        Args:
+            pose: As ``plan_pose`` of :meth:`begin` [m, m, rad].
+
+        Raises:
+            ValueError: If a number is not finite or too large, or there is no plan.
+        """
+        if self._plan is None:
+            raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
+        moved = _placed(self._plan.world, pose)
+        if self._plan.is_off(moved.pose):
+            self._plan, self._center, self._fresh_map = moved, moved.middle, True
+
     def arrived(self, pose: tuple[float, float, float]) -> bool:
-        """Return True if a pose is at the goal, as the training counted it."""
-        return self._goal is not None and math.dist(pose[:2], self._goal) <= self.card.goal_radius
+        """Return True if a pose is at the goal, with the heading that :meth:`begin` was given."""
+        if self._goal is None:
+            return False
+        # The robot takes a little way to stop.
+        near = (2.0 if self._there else 1.0) * self.goal_radius
+        there = math.dist(pose[:2], self._goal) <= near
+        if self._heading is None:
+            return there
+        self._there = there
+        return there and abs(math.remainder(self._heading - pose[2], math.tau)) <= _FACING
 
     def observe(
         self,
@@ -291,13 +386,13 @@ class Pilot:
         self.give(self._time, 0.0, 0.0)
         card = self.card
         center = self._center or (x, y)
-        self._check_on_map(self._goal, center)
+        self._check_on_map(self._goal, center, self._plan)
         ranges, points = self.sectors.read(scan)
         path = np.zeros((0, 3))
         if self._map is not None:
-            if self._fresh:
-                self._map.begin(center)
-                self._center = center
+            if self._fresh or self._fresh_map:
+                self._map.begin(center, self._sides(self._plan), self._plan)
+                self._center, self._fresh_map = center, False
             path = self._map.sense(ahead[0], taken, self._goal, points)
         robot = card.robot
         rows = []
@@ -306,7 +401,14 @@ class Pilot:
             if (state[:3] != taken).any():
                 seen = np.empty(card.sectors * (1 if card.reduction == "single" else _REDUCED))
                 view = math.radians(card.field_of_view)
-                look_from(state[:3], *points, taken, card.max_range, view, seen)
+                look_from(
+                    lidar_pose(state, robot.lidar_mount[0], robot.lidar_mount[1]),
+                    *points,
+                    taken,
+                    card.max_range,
+                    view,
+                    seen,
+                )
             observation = self._observation.copy()
             observe_all(
                 np.array([[*state[:3], *(state[3:] / self.pace)]]),
@@ -355,8 +457,12 @@ class Pilot:
         Raises:
             ScanError: Also if it would drive where it does not see and cannot turn on the spot.
         """
+        if self._heading is not None and not self.arrived(pose) and self._there:
+            self._time = self._time + self.period if time is None else time
+            return self._turn(self._heading - pose[2], speeds[0])
         observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
+        slower = self._landing(pose)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
@@ -364,17 +470,31 @@ class Pilot:
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
         back = self._way_back.speeds(pose, self._time, reverses=reverses)
         left, right = back or learned.wheel_speeds(action)
+        share = min(1.0, slower / max(abs(left + right) / 2.0, 1e-9))
+        left, right = share * left, share * right
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
-        if (np.abs(towards) < _TOWARDS).any():
-            left, right = 0.5 * (left - right), 0.5 * (right - left)
+        backwards = left + right < 0.0 and not self.robot.reverse
+        if backwards or (np.abs(towards) < _TOWARDS).any():
+            # Wheels that do not turn backwards cannot turn the robot on the spot: it stands.
+            most = max(min(learned.max_wheel_speed, -learned.min_wheel_speed), 0.0)
+            right = min(max(0.5 * (right - left), -most), most)
+            left = -right
         if self._keep is not None:
+            if (np.cos(blind) > _BESIDE).any():
+                raise ScanError(
+                    "the scan must look at all directions up to 90 degrees from ahead for the "
+                    "filter (clearance), which does not drive beside what is not seen"
+                )
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             states[:, : self.card.sectors][:, hidden] = 1.0
             slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
             action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
             left, right = learned.wheel_speeds(self._keep.among(states, action))
         linear = self.pace * 0.5 * (left + right)
-        angular = self.pace * (right - left) / learned.wheel_base
+        return self._command(linear, self.pace * (right - left) / learned.wheel_base)
+
+    def _command(self, linear: float, angular: float) -> Command:
+        """The command for speeds of the body [m/s, rad/s]."""
         turn = 0.5 * angular * self.robot.wheel_base
         if linear - abs(turn) < self.robot.min_wheel_speed - tolerance(self.robot):
             raise ScanError(
@@ -389,6 +509,37 @@ class Pilot:
         """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
         return self._way_back.stands_still
 
+    def _landing(self, pose: tuple[float, float, float]) -> float:
+        """Greatest speed of the policy's robot with which it stops at the goal [m/s]."""
+        as_learned = self._heading is None and self.goal_radius >= self.card.goal_radius
+        if self._goal is None or as_learned or not self.robot.can_stop:
+            return math.inf
+        away = math.dist(pose[:2], self._goal)
+        # Half the braking, as decisions are late; what remains at the goal is stopped within it.
+        braking = self.robot.wheel_limits.acceleration / self.pace**2
+        if math.isinf(braking):
+            return math.inf
+        late = self.latency * self.pace
+        # v * late + v² / braking is the way until it stands.
+        return 0.5 * braking * (math.sqrt(late * late + 4.0 * max(away, _LAST) / braking) - late)
+
+    def _spot_speed(self) -> float:
+        """Fastest turn on the spot [rad/s]."""
+        robot = self.robot
+        wheels = min(robot.max_wheel_speed, -robot.min_wheel_speed)
+        return min(robot.max_angular_speed, 2.0 * wheels / robot.wheel_base)
+
+    def _turn(self, off: float, speed: float) -> Command:
+        """The command that turns a robot with a speed [m/s] by an angle at the goal [rad]."""
+        if abs(speed) > _STANDS:
+            return self._command(0.0, 0.0)
+        off, limits = math.remainder(off, math.tau), self.robot.wheel_limits
+        change = 2.0 * min(limits.acceleration, limits.turning) / self.robot.wheel_base
+        fastest = min(self._spot_speed(), 0.5 * abs(off) / (self.period + self.latency))
+        if math.isfinite(change):
+            fastest = min(fastest, math.sqrt(change * abs(off)))
+        return self._command(0.0, math.copysign(fastest, off))
+
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
     ) -> tuple[float, float]:
@@ -402,17 +553,12 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        known = self.card.robot.wheel_limits.acceleration * self.pace**2
-        if math.isinf(known):
+        limits = self.card.robot.wheel_limits
+        if math.isinf(min(limits.acceleration, limits.turning)):
             return wanted
         half = 0.5 * self.card.robot.wheel_base
-        left, right = (
-            min(max(to, now - known * passed), now + known * passed)
-            for now, to in (
-                (last[0] + side * half * last[1], wanted[0] + side * half * wanted[1])
-                for side in (-1.0, 1.0)
-            )
-        )
+        now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
+        left, right = changed(now, to, limits, limits.acceleration, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half
 
     def _filter(self, clearance: float) -> SafetyFilter:
@@ -420,10 +566,13 @@ class Pilot:
         card, learned = self.card, self.card.robot
         braking = self.robot.wheel_limits.acceleration / widening(self.robot, learned)
         braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
+        turns = min(turning(learned), turning(self.robot) / self.pace**2)
         body = replace(
             learned,
             radius=max(self.robot.radius, 0.5 * learned.wheel_base),
             wheel_acceleration=None if math.isinf(braking) else braking,
+            turn_acceleration=None if math.isinf(turns) else turns,
+            reverse=learned.reverse and self.robot.reverse,
         )
         repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
         rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
@@ -441,16 +590,35 @@ class Pilot:
             braking=STRENGTH,
         )
 
-    def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
+    def _sides(self, plan: Plan | None) -> tuple[float, float]:
+        """Width and depth of the map [m]."""
+        side = _LARGEST_MAP if self._map is None else self._map_size
+        return (side, side) if plan is None else plan.size
+
+    def _check_on_map(
+        self, goal: tuple[float, float], center: tuple[float, float] | None, plan: Plan | None
+    ) -> None:
         """Reject a goal beyond the map, once its center is known, or one in another unit."""
         if center is None:
             return
-        side, name = (_LARGEST_MAP, "") if self._map is None else (self._map_size, " (map_size)")
-        if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * side:
+        width, depth = self._sides(plan)
+        if abs(goal[0] - center[0]) > 0.5 * width or abs(goal[1] - center[1]) > 0.5 * depth:
+            size = f"{width:g} m" + " (map_size)" * (self._map is not None)
+            if plan is not None:
+                size = f"{width:g} m x {depth:g} m (plan)"
             raise ValueError(
-                f"goal must be on the map, {side:g} m{name} around "
+                f"goal must be on the map, {size} around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
+
+
+def _placed(world: World, pose: tuple[float, float, float]) -> Plan:
+    """A plan at a pose."""
+    # Imported here because it needs Numba.
+    from mpfa_envs.deploy.map_path import Plan
+
+    x, y, heading = check_finite("plan_pose", pose, 3)
+    return Plan(world, (*_pair("plan_pose", (x, y)), heading))
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:

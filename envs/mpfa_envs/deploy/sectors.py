@@ -69,6 +69,16 @@ class _Rays(NamedTuple):
     """True if they have measured something, ``[R]``."""
     step: float
     """Angle from ray to ray [rad]."""
+    middle: float
+    """Middle of the angle that they cover [rad]."""
+    ends: tuple[float, float]
+    """Directions, from there, where it ends, as they are from the place of the sectors [rad]."""
+
+    def cover(self, angles: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return True for directions between the outermost rays."""
+        right, left = self.ends
+        off = _wrapped(angles - self.middle)
+        return np.asarray((off >= right - _EDGE) & (off <= left + _EDGE))
 
 
 class Points(NamedTuple):
@@ -84,7 +94,8 @@ class Points(NamedTuple):
 class Sectors:
     """Reads scans as a policy does.
 
-    All valid rays of a sector count: with ``min`` the nearest return,
+    The sectors are around the place of the lidar that the policy learned with, the ``lidar_mount``
+    of its robot. All valid rays of a sector count: with ``min`` the nearest return,
     with ``median`` the median, with ``single`` the ray nearest to the middle. A sector between two
     rays of a coarse scan has the nearer one. To the policy, what is too near to be measured is at
     the scan's ``range_min``; for whether the robot may drive, :meth:`around`, it is at 0 m.
@@ -93,8 +104,8 @@ class Sectors:
         card: Of the policy.
         mount: Position (x, y) of the sensor and direction of its x axis in the robot's frame
             [m, m, rad], and its roll around that axis, if it has one: 0, or ±π upside down [rad].
-        unseen: Range to report to the policy for sectors outside of the scan's field of view [m];
-            None rejects such a scan.
+        unseen: Range to report to the policy for sectors outside of the scan's field of view, as it
+            is from there [m]; None rejects such a scan.
         silent: Reading of a sector without a valid ray: ``"reject"`` rejects the scan, ``"far"``
             holds that nothing is there, for a lidar that reports 0 or NaN for it. As such a lidar
             may report the same for what is too near, a return within 0.08 m of ``range_min`` then
@@ -138,9 +149,10 @@ class Sectors:
         Raises:
             ScanError: If it is no scan, or lacks the range of a sector.
         """
-        rays, points, _ = self._measured(scan)
+        rays, around, points, _ = self._measured(scan)
         card = self.card
         view = np.abs(points.angles) <= self._edge + _EDGE
+        around = Points(around.angles[view], around.ranges[view])
         points = Points(points.angles[view], points.ranges[view])
         sector = self._index(points.angles)
         key = points.ranges
@@ -160,7 +172,7 @@ class Sectors:
             ranges[full] = ordered[start]
         for index in np.flatnonzero(~full).tolist():
             ranges[index] = self._beside(index, rays, points)
-        return ranges, points
+        return ranges, around
 
     def around(self, scan: Scan) -> Points:
         """Read a scan for whether a robot may drive on.
@@ -175,7 +187,7 @@ class Sectors:
         Raises:
             ScanError: If it is no scan.
         """
-        rays, points, distances = self._measured(scan)
+        rays, points, _, distances = self._measured(scan)
         silent = rays.directions[~rays.valid]
         ranges = np.where(distances <= scan.range_min, 0.0, points.ranges)
         return Points(
@@ -194,12 +206,12 @@ class Sectors:
             Directions in the robot's frame, 5 degrees apart [rad], ``[D]``; and for each sector
             whether one of them is in it, ``[sectors]``.
         """
-        count, step = np.size(scan.ranges), self._side * scan.angle_increment
-        middle = self._side * scan.angle_min + self.mount[2] + 0.5 * step * (count - 1)
-        half = 0.5 * abs(step) * count + _EDGE
-        directions = _AROUND[np.abs(_wrapped(_AROUND + turn - middle)) > half]
+        rays = self._measured(scan)[0]
+        half = 0.5 * rays.step * rays.valid.size + _EDGE
+        directions = _AROUND[np.abs(_wrapped(_AROUND + turn - rays.middle)) > half]
+        missed = _AROUND[~rays.cover(_AROUND + turn) & (np.abs(_AROUND) <= self._edge)]
         hidden = np.zeros(self.card.sectors, dtype=np.bool_)
-        hidden[self._index(directions[np.abs(directions) <= self._edge])] = True
+        hidden[self._index(missed)] = True
         return directions, hidden
 
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -207,8 +219,11 @@ class Sectors:
         index = ((self._edge - angles) / self._width).astype(np.int64)
         return np.clip(index, 0, self.card.sectors - 1)
 
-    def _measured(self, scan: Scan) -> tuple[_Rays, Points, NDArray[np.float64]]:
-        """All rays, the points around the robot, and how far these are from the sensor [m]."""
+    def _measured(self, scan: Scan) -> tuple[_Rays, Points, Points, NDArray[np.float64]]:
+        """All rays, the points from the robot's center and from the sectors' place, and how far.
+
+        The last are the distances of the points from the sensor [m].
+        """
         ranges = np.asarray(scan.ranges, dtype=np.float64)
         start, step = scan.angle_min, scan.angle_increment
         least, most = scan.range_min, scan.range_max
@@ -251,11 +266,43 @@ class Sectors:
             before = ", and the one before met something near" if self._met else ""
             raise ScanError(f"none of the scan's {ranges.size} rays is valid{before}")
         ranges = np.where(too_near, least, ranges)
-        rays = _Rays(directions, valid | too_near, abs(step))
+        middle = self.mount[2] + 0.5 * float(along[0] + along[-1])
+        rays = _Rays(directions, valid | too_near, abs(step), middle, (0.0, 0.0))
+        here, there = self.mount[:2], self.card.robot.lidar_mount[:2]
+        place = here[0] - there[0], here[1] - there[1]
+        rays = rays._replace(
+            ends=self._ends(rays, ranges, most, place, leftward=along[-1] >= along[0])
+        )
         angles, distances = directions[rays.valid], ranges[rays.valid]
         if self.silent == "far":
             angles, distances = self._with_near(rays, angles, distances, least + _NEAR)
-        return rays, self._around_center(angles, distances, distances >= most), distances
+        missed = distances >= most
+        around = self._seen_from(angles, distances, missed, *here)
+        return rays, around, self._seen_from(angles, distances, missed, *place), distances
+
+    def _ends(
+        self,
+        rays: _Rays,
+        ranges: NDArray[np.float64],
+        most: float,
+        place: tuple[float, float],
+        *,
+        leftward: bool,
+    ) -> tuple[float, float]:
+        """Where the angle that the rays cover ends, from its middle, with the sensor at a place."""
+        half = 0.5 * rays.step * rays.valid.size
+        if half + 0.5 * rays.step > math.pi:
+            return -math.pi, math.pi
+        ends = [-half, half]
+        # The rays of a sensor that turns to the right, or hangs upside down, begin at the left.
+        outermost = (0, -1) if leftward else (-1, 0)
+        for end, ray in enumerate(outermost if any(place) else ()):
+            one = slice(ray, ray + 1 or None)
+            if rays.valid[ray]:
+                at = self._seen_from(rays.directions[one], ranges[one], ranges[one] >= most, *place)
+                moved = _wrapped(at.angles - rays.directions[one])
+                ends[end] += float(moved[0])
+        return ends[0], ends[1]
 
     def _with_near(
         self,
@@ -277,17 +324,21 @@ class Sectors:
         self._near = angles[distances <= near], distances[distances <= near]
         return angles, distances
 
-    def _around_center(
-        self, angles: NDArray[np.float64], distances: NDArray[np.float64], missed: NDArray[np.bool_]
+    def _seen_from(
+        self,
+        angles: NDArray[np.float64],
+        distances: NDArray[np.float64],
+        missed: NDArray[np.bool_],
+        across: float,
+        up: float,
     ) -> Points:
-        """The sensor's measurements seen from the robot's center."""
-        across, up, _ = self.mount
+        """The measurements of a sensor, seen from where it is at (across, up) [m]."""
         far = self.card.max_range
         distances = np.where(missed, far, distances)
         if across or up:
             met_x = across + distances * np.cos(angles)
             met_y = up + distances * np.sin(angles)
-            # A ray that met nothing has the same direction from the center.
+            # A ray that met nothing has the same direction from there.
             angles = np.where(missed, angles, np.arctan2(met_y, met_x))
             distances = np.where(missed, far, np.hypot(met_x, met_y))
         return Points(angles, np.minimum(distances, far))
@@ -296,20 +347,19 @@ class Sectors:
         """Range of a sector in which no valid ray has met anything [m]."""
         middle, half = float(self._middles[index]), 0.5 * self._width
         off = np.abs(_wrapped(rays.directions - middle))
-        reach = half + rays.step
         degrees = round(math.degrees(middle))
-        if off.min() > reach + _EDGE:
+        if not rays.cover(self._middles[index]):
             if self.unseen is None:
                 raise ScanError(f"the scan does not reach the sector at {degrees} degrees")
             return min(self.unseen, self.card.max_range)
         within = off <= half + _EDGE
         own = rays.valid[within][self._index(rays.directions[within]) == index]
-        # A sensor that is not at the center sees near points in other directions.
+        # A sensor that is elsewhere sees near points in other directions.
         moved = bool(own.any())
         if points.angles.size and (moved or not own.size):
             beside = np.abs(_wrapped(points.angles - middle))
             nearest = int(beside.argmin())
-            if beside[nearest] <= reach + moved * half + _EDGE:
+            if moved or beside[nearest] <= half + rays.step + _EDGE:
                 return float(points.ranges[nearest])
         if self.silent == "reject":
             raise ScanError(f"no ray of the sector at {degrees} degrees is valid")

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 Progress = Literal["straight_line", "shortest_path", "none"]
 """Measure of the reward's progress."""
 
+Knowledge = Literal["unknown", "known"]
+"""What a robot's map knows when an episode begins."""
+
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "max_steps": 500,
@@ -59,6 +62,7 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "contact": partial(check_choice, kinds=Literal[True, False]),
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
+    "plan": partial(check_choice, kinds=Knowledge),
     "progress_scale": check_number,
     "clearance": check_not_negative,
     "max_steps": partial(check_count, most=_MOST_STEPS),
@@ -160,6 +164,9 @@ class TaskConfig:
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
     before it and nothing else."""
+    plan: Knowledge = "unknown"
+    """``"known"``: the robot's map begins with all obstacles and walls that stand, as a robot that
+    was given the plan of its building; ``"unknown"``: it begins empty."""
     history: int = 0
     """Number of earlier scans that it senses in addition to the last one, sector by sector: those
     of the decisions before, the newest first, which show what moves."""
@@ -173,8 +180,8 @@ class TaskConfig:
     observation is that of the state to which the orders under way bring the robot, as a
     :class:`~mpfa_envs.deploy.Pilot` observes it. None: that of the robot."""
     closeness_distance: float = None  # type: ignore[assignment]
-    """A range of this or less has closeness one [m]. None: the robot's radius and the clearance,
-    with ``contact`` too."""
+    """A range of this or less has closeness one [m]. None: the least distance from the lidar to
+    the robot's rim and the clearance, with ``contact`` too."""
     min_goal_distance: float = 2.0
     """Least distance between a sampled start and goal [m]."""
     detour_chance: float = 0.8
@@ -186,7 +193,7 @@ class TaskConfig:
         self._set("robot", robot)
         if self.closeness_distance is None:
             clearance = check_not_negative("clearance", self.clearance)
-            self._set("closeness_distance", round(robot.radius + clearance, 9))
+            self._set("closeness_distance", round(robot.lidar_to_rim + clearance, 9))
         self._set("noise", resolve_noise(self.noise))
         self._set("latency", _read_latency(robot.latency if self.latency is None else self.latency))
         check_positive("time_step", self.time_step)
@@ -199,6 +206,11 @@ class TaskConfig:
             raise ValueError(
                 f"min_goal_distance must be above goal_radius = {self.goal_radius}, "
                 f"got {self.min_goal_distance}"
+            )
+        if self.plan == "known" and self.memory != "map":
+            raise ValueError(
+                f"plan must be 'unknown' without a map (memory='map'), got {self.plan!r} with "
+                f"memory={self.memory!r}"
             )
         # Collisions are checked at the end of each time step. A robot that drives no farther than
         # the collision distance in one cannot get its center into an obstacle in between.
@@ -247,7 +259,7 @@ class TaskConfig:
     def make_lidar(self, world: World = _EMPTY) -> Lidar:
         """Make the lidar, in a world."""
         try:
-            return Lidar(world, **self.lidar)
+            return Lidar(world, **self.lidar, mount=self.robot.lidar_mount[:2])
         except TypeError as error:
             raise ValueError(
                 f"lidar must hold arguments of Lidar, got {self.lidar!r}: {error}"
@@ -280,20 +292,26 @@ class TaskConfig:
         """Make the transform that shows a learner half of its transitions in the mirror.
 
         Front and rear are swapped as well if robot and lidar have them alike: wheels that are as
-        fast backwards, and a whole turn of sectors.
+        fast backwards, and a whole turn of sectors around the center.
 
         Args:
             pairs: As for :class:`~mpfa_envs.Mirror`; with these front and rear stay.
 
         Raises:
-            ValueError: If a pair has no mirror image among them.
+            ValueError: If a pair has no mirror image among them, or the lidar is at a side.
         """
         # Most of what a task is for needs no PyTorch.
         from mpfa_envs.sensing.mirror import RandomMirror
 
         lidar, robot = self.make_lidar(), self.robot
         all_around = lidar.field_of_view == 360.0 and lidar.sectors % 2 == 0
-        alike = all_around and robot.min_wheel_speed == -robot.max_wheel_speed
+        if lidar.mount[1]:
+            raise ValueError(
+                f"mirror must be False for {robot.name!r}, whose lidar is {lidar.mount[1]:g} m to "
+                "the left of its axis (lidar_mount): left and right differ"
+            )
+        alike = all_around and robot.reverse and robot.min_wheel_speed == -robot.max_wheel_speed
+        alike = alike and not lidar.mount[0]
         return RandomMirror(
             sectors=lidar.sectors,
             memory=self.memory,
@@ -358,6 +376,7 @@ class TaskConfig:
             described.update(zip(_PAYMENTS, payments, strict=True))
         lidar = self.make_lidar()
         described.update(rays=lidar.angles.size, sectors=lidar.sectors)
+        described["lidar.mount"] = list(lidar.mount)
         return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}
 
 

@@ -17,6 +17,8 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.lengths import grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
+from mpfa_envs.safety.filter import CLEARANCE
+from mpfa_envs.tasks.doors import cell_share, warn_of_parts
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
@@ -54,7 +56,7 @@ class Episode(NamedTuple):
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
     """Measure the paths to a goal that keep a distance [m]; on a map only around the goal."""
     longest = math.inf if world.occupancy is None else LONGEST_PATH
-    return DistanceField(grid_for(world, distance), goal, longest)
+    return DistanceField(grid_for(world, distance, cell_share(world)), goal, longest)
 
 
 class EpisodeSource:
@@ -94,6 +96,9 @@ class EpisodeSource:
                 )
         self._difficulty = difficulty
         fixed = [] if self._generator else _resolve_worlds(world)
+        kept = max(config.collision_distance - config.robot.radius, CLEARANCE)
+        for place in dict.fromkeys(fixed):
+            warn_of_parts(place, config.robot, kept)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
         self.begins: dict[int, Beginning] = {}
@@ -252,7 +257,8 @@ class EpisodeSource:
             min_goal_distance=config.min_goal_distance,
             detour_chance=config.detour_chance,
         )
-        length = shortest_length(world, config.robot.radius, task.start[:2], task.goal)
+        ends = task.start[:2], task.goal
+        length = shortest_length(world, config.robot.radius, *ends, cell_share(world))
         along = config.progress == "shortest_path"
         field = distance_field(world, distance, task.goal) if along else None
         return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
@@ -262,7 +268,10 @@ class EpisodeSource:
         config = self._config
         distance = config.collision_distance
         # A generator's worlds do not come again.
-        grid = FreeGrid(world, distance=distance) if self._generator else grid_for(world, distance)
+        if self._generator:
+            grid = FreeGrid(world, distance=distance)
+        else:
+            grid = grid_for(world, distance, cell_share(world))
         task, field = sample_task_on_grid(
             grid,
             rng,

@@ -70,6 +70,11 @@ class GoalRelabeling:
                 "progress must be 'none' with goals in hindsight, as progress to one goal is none "
                 f"to another, got {config.progress!r}"
             )
+        if config.plan == "known":
+            raise ValueError(
+                "plan must be 'unknown' with goals in hindsight, whose maps begin empty, got "
+                f"{config.plan!r}"
+            )
         self._config, self._lidar, self._goal_reward = config, config.make_lidar(), payments[0]
 
     def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:

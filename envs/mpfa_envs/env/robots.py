@@ -25,7 +25,7 @@ from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
-from mpfa_envs.sensing.observation_loops import look_from, observe_all
+from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.arrays import grown
@@ -138,7 +138,8 @@ class RobotBatch:
         if self._orders is not None:
             self._orders.begin(index, rng)
         if self.memory is not None:
-            self.memory.begin(index, episode.world)
+            plan = episode.world if self._config.plan == "known" else None
+            self.memory.begin(index, episode.world, plan=plan)
 
     def wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         """Speeds [m/s] of the left and the right wheel, ``[N, 2]``, by actions of that shape."""
@@ -305,10 +306,10 @@ class RobotBatch:
         view = math.radians(lidar.field_of_view)
         for index in np.flatnonzero(chosen).tolist():
             look_from(
-                held[index],
+                lidar_pose(held[index], lidar.mount[0], lidar.mount[1]),
                 lidar.angles,
                 self.ranges[index],
-                here[index],
+                lidar_pose(here[index], lidar.mount[0], lidar.mount[1]),
                 lidar.max_range,
                 view,
                 seen[index],
@@ -334,7 +335,7 @@ class RobotBatch:
                 goal=tuple(self.episodes.goals[index].tolist()),
                 goal_radius=self._config.goal_radius,
                 trail=self.trail(index),
-                rays=(self._lidar.angles, self.ranges[index].copy()),
+                rays=self._lidar.around_center(self.ranges[index].copy()),
                 sketch=None if self.memory is None else self.memory.sketch(index, x, y),
                 walkers=self.walkers.of(index),
             )

@@ -20,17 +20,20 @@ them."""
 _FIXED_RADIUS: Final = 0.18
 _TOUCH: Final = 1e-9
 """A line that grazes a grown obstacle by less than this does not cross it [m]."""
-_NARROW: Final = 0.2
+NARROW: Final = 0.2
 """Cells are this much shorter where no path is found, as a passage may be narrow."""
 
 
 # A reset measures a task twice, and an evaluation measures it before its first episode.
 @lru_cache(maxsize=512)
-def shortest_length(world: World, radius: float, start: Point, goal: Point) -> float:
+def shortest_length(
+    world: World, radius: float, start: Point, goal: Point, share: float = 1.0
+) -> float:
     """Measure the shortest path of a disc [m]; infinite if there is none.
 
     A free straight line is measured exactly, and a path around obstacles over cells of 0.1 m, or of
-    0.02 m where those have no path; in a room of more than 40,000 m² cells are longer.
+    0.02 m where those have no path; in a room of more than 40,000 m² cells are longer. The share
+    makes the cells of 0.1 m shorter.
     """
     fixed = _fixed_lengths(world.name) if radius == _FIXED_RADIUS else {}
     if fixed and world == WORLDS[world.name] and (start, goal) in fixed:
@@ -40,9 +43,9 @@ def shortest_length(world: World, radius: float, start: Point, goal: Point) -> f
     straight = math.dist(start, goal)
     if world.clearance_along(start, goal) >= radius - _TOUCH:
         return straight
-    length = grid_for(world, radius).length(start, goal)
+    length = grid_for(world, radius, share).length(start, goal)
     if length == math.inf:
-        length = grid_for(world, radius, _NARROW).length(start, goal)
+        length = grid_for(world, radius, NARROW).length(start, goal)
     # Moves are measured a little short, so that a path may seem shorter than the straight line.
     return max(length, straight)
 
@@ -51,7 +54,7 @@ def is_reachable(world: World, distance: float, start: Point, goal: Point) -> bo
     """Return True if a path that keeps a distance [m] joins two positions."""
     return _fits(world, distance, start, goal) and (
         grid_for(world, distance).joins(start, goal)
-        or grid_for(world, distance, _NARROW).joins(start, goal)
+        or grid_for(world, distance, NARROW).joins(start, goal)
     )
 
 

@@ -133,12 +133,15 @@ class DynamicWindow:
         task = TaskConfig(robot=self.robot, **settings)
         self._lidar = task.make_lidar()
         self.closeness_distance = task.closeness_distance
+        limits = self.robot.wheel_limits
         if acceleration is None:
-            acceleration = self.robot.wheel_acceleration or _ACCELERATION
+            unlimited = math.isinf(limits.acceleration)
+            acceleration = _ACCELERATION if unlimited else limits.acceleration
         self.change = check_positive("acceleration", acceleration) * check_positive(
             "decision", decision
         )
         """By how much a wheel's speed can change until the next decision [m/s]."""
+        self._turning = min(limits.turning * decision, self.change)
         slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
         if length is None:
             half_turn = 0.5 * math.pi * self.robot.wheel_base * (fast + slow) / (fast - slow)
@@ -155,7 +158,7 @@ class DynamicWindow:
         view = math.radians(self._lidar.field_of_view)
         angles = view * (0.5 - (np.arange(count) + 0.5) / count)
         self._directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-        reverses = self._lidar.field_of_view >= 360.0
+        reverses = self._lidar.field_of_view >= 360.0 and self.robot.reverse
         self.pairs = _pairs(self.robot, samples, min(_RESOLUTION, self.change), reverses=reverses)
         """Speeds of the left and the right wheel [m/s], ``[K, 2]``."""
         left, right = self.pairs.T
@@ -230,6 +233,8 @@ class DynamicWindow:
         # A wheel that slips, or stands as in the beginning, is outside the range of speeds.
         now = np.clip(now, robot.min_wheel_speed, robot.max_wheel_speed)
         changes = np.abs(self.pairs - now).max(axis=1)
+        turns = 0.5 * np.abs(self.pairs[:, 1] - self.pairs[:, 0] - now[1] + now[0])
+        changes = np.maximum(changes, turns * (self.change / self._turning))
         # The nearest where none of few samples is near enough.
         return np.flatnonzero(changes <= max(self.change, changes.min()) + 1e-9)
 
@@ -240,13 +245,14 @@ class DynamicWindow:
         closeness = row[self._parts["lidar"]]
         ranges = self.closeness_distance / np.maximum(closeness, 1e-9)
         met = ranges < 0.999 * self._lidar.max_range
-        points = self._directions[met] * ranges[met, None]
+        points = self._directions[met] * ranges[met, None] + self._lidar.mount
         if not len(points):
             return np.full(arcs.shape[:2], math.inf)
         gaps = arcs[:, :, None, :] - points
         squares = np.einsum("ktpc,ktpc->ktp", gaps, gaps)
         # What is nearer already counts as if it were as far as it may be, and may not get nearer.
-        spare = np.maximum(self.robot.radius + self.score.least + 1e-9 - ranges[met], 0.0)
+        away = np.hypot(*points.T) if any(self._lidar.mount) else ranges[met]
+        spare = np.maximum(self.robot.radius + self.score.least + 1e-9 - away, 0.0)
         return np.asarray((np.sqrt(squares) + spare).min(axis=2) - self.robot.radius)
 
     def _heading(

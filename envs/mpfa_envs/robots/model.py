@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import MISSING, dataclass, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
 from mpfa_envs.checks import (
+    check_choice,
     check_count,
     check_meant,
     check_not_negative,
@@ -33,7 +34,9 @@ PAPER_CLEARANCE: Final = 0.17
 A passage of 0.9 m then has 0.2 m left to drive in, and robots turn away from it.
 """
 
-_CHECKED: Final = ("lidar_rays", "lidar_mount")
+_NEAREST: Final = 0.05
+"""Least distance at which ranges can be told apart [m]."""
+_CHECKED: Final = ("lidar_rays", "lidar_mount", "reverse")
 """Fields with checks of their own."""
 _LEVEL: Final = math.radians(10.0)
 """Greatest roll of a lidar that counts as level [rad]."""
@@ -53,8 +56,15 @@ class RobotModel:
         min_wheel_speed: Slowest speed of a wheel over the ground [m/s].
         max_wheel_speed: Fastest speed of a wheel over the ground [m/s].
         wheel_acceleration: How fast the speed of a wheel changes [m/s²]; None: at once.
+        deceleration: How fast the robot brakes, where that is slower [m/s²]: the smaller one of
+            both holds for driving off and braking alike; None: as it accelerates.
         turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
             as they can. Both wheels then change by the same, so that the forward speed stays.
+        turn_acceleration: How fast its turn changes, where its wheels could change it faster
+            [rad/s²]; None: as they can.
+        reverse: False if its controller does not let the body drive backwards; its wheels still
+            turn it on the spot. Give the ``min_wheel_speed`` that this takes and no less, as a
+            policy learns slowly where most actions turn it on the spot.
         field_of_view: Angle that its lidar sees, which its front halves [deg]. The default does not
             fit a robot that reverses: filter, dynamic window and pilot keep it from driving where
             it does not see. Give 360.
@@ -62,8 +72,8 @@ class RobotModel:
             of 10 degrees, but at most three; None: three.
         lidar_range: A ray that meets nothing within this distance reports this distance [m].
         lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
-            [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. A pilot reads
-            scans by it; in training rays begin at the robot's center.
+            [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. Rays begin
+            there. A pilot turns scans by the angles, and in training the lidar looks ahead.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s].
 
@@ -90,7 +100,10 @@ class RobotModel:
     min_wheel_speed: float
     max_wheel_speed: float
     wheel_acceleration: float | None = None
+    deceleration: float | None = None
     turn_limit: float | None = None
+    turn_acceleration: float | None = None
+    reverse: bool = True
     field_of_view: float = 180.0
     lidar_rays: int | None = None
     lidar_range: float = 10.0
@@ -101,6 +114,7 @@ class RobotModel:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
         object.__setattr__(self, "lidar_mount", check_mount("lidar_mount", self.lidar_mount))
+        check_choice("reverse", self.reverse, Literal[True, False])
         if self.lidar_rays is not None:
             check_count("lidar_rays", self.lidar_rays)
         for field in fields(self)[1:]:
@@ -109,7 +123,7 @@ class RobotModel:
                 continue
             check = {"min_wheel_speed": check_number, "latency": check_not_negative}
             check.get(field.name, check_positive)(field.name, value)
-        keep(self, *(field.name for field in fields(self)[1:] if field.name != "lidar_mount"))
+        keep(self, *(field.name for field in fields(self)[1:] if field.name not in _CHECKED[1:]))
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"
@@ -160,11 +174,20 @@ class RobotModel:
         return self.min_wheel_speed <= 0.0 <= self.max_wheel_speed
 
     @property
+    def lidar_to_rim(self) -> float:
+        """Least distance from the lidar to the rim [m]; 0.05 m for a lidar that is nearer."""
+        return max(self.radius - math.hypot(*self.lidar_mount[:2]), _NEAREST)
+
+    @property
     def wheel_limits(self) -> WheelLimits:
         """Limits of the wheels, as compiled loops read them."""
-        change = math.inf if self.wheel_acceleration is None else self.wheel_acceleration
-        across = math.inf if self.turn_limit is None else 0.5 * self.turn_limit * self.wheel_base
-        return WheelLimits(self.min_wheel_speed, self.max_wheel_speed, across, change)
+        change = min(self.wheel_acceleration or math.inf, self.deceleration or math.inf)
+        across, turning = (
+            math.inf if limit is None else 0.5 * limit * self.wheel_base
+            for limit in (self.turn_limit, self.turn_acceleration)
+        )
+        slow, fast = self.min_wheel_speed, self.max_wheel_speed
+        return WheelLimits(slow, fast, across, change, turning, self.reverse)
 
     def wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
         """Read an action.

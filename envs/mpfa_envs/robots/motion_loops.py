@@ -24,6 +24,10 @@ class WheelLimits(NamedTuple):
     """Greatest difference of a wheel's speed from the mean of both [m/s]."""
     acceleration: float
     """Acceleration of a wheel [m/s²]."""
+    turning: float = math.inf
+    """By how much that difference changes at most [m/s²]."""
+    reverse: bool = True
+    """False if the mean of both is never below 0."""
 
 
 _ROUNDING = 1e-12
@@ -43,6 +47,10 @@ def limited(left: float, right: float, limits: WheelLimits) -> tuple[float, floa
     slow, fast = limits.slow - _ROUNDING, limits.fast + _ROUNDING
     left = left if slow <= left <= fast else min(max(left, limits.slow), limits.fast)
     right = right if slow <= right <= fast else min(max(right, limits.slow), limits.fast)
+    if left + right < 0.0 and not limits.reverse:
+        across = min(max(0.5 * (right - left), limits.slow), -limits.slow)
+        across = min(max(across, -limits.fast), limits.fast)
+        left, right = -across, across
     return left, right
 
 
@@ -64,6 +72,35 @@ def scale_actions(
 
 
 @njit
+def _changed(speed: float, wanted: float, faster: float, slower: float) -> float:
+    """The speed of a wheel that changes by so much at most [m/s]."""
+    change = slower if abs(wanted) < abs(speed) or wanted * speed < 0.0 else faster
+    return min(max(wanted, speed - change), speed + change)
+
+
+@njit
+def changed(
+    now: tuple[float, float],  # [m/s]
+    wanted: tuple[float, float],  # [m/s]
+    limits: WheelLimits,
+    braking: float,  # how fast a wheel slows down [m/s²]
+    time: float,  # [s]
+) -> tuple[float, float]:
+    """The speeds nearest to the wanted ones that the wheels can have after a time [m/s]."""
+    left, right = now
+    most = limits.turning * time
+    to_left = _changed(left, wanted[0], limits.acceleration * time, braking * time)
+    to_right = _changed(right, wanted[1], limits.acceleration * time, braking * time)
+    across = 0.5 * ((to_right - right) - (to_left - left))
+    # The forward speed changes as it would, and the turn as fast as it may.
+    if abs(across) > most:
+        forward = 0.5 * ((to_right - right) + (to_left - left))
+        across = math.copysign(most, across)
+        to_left, to_right = left + forward - across, right + forward + across
+    return to_left, to_right
+
+
+@njit
 def accelerate(
     speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2], changed in place
     wanted: NDArray[np.float64],  # [m/s], [N, 2]
@@ -72,12 +109,13 @@ def accelerate(
     time_step: float,  # [s]
 ) -> None:
     """Bring the speeds of the wheels as near to the wanted ones as one time step allows."""
-    change = limits.acceleration * time_step
     for robot in range(speeds.shape[0]):
         if running[robot]:
-            left, right = limited(wanted[robot, 0], wanted[robot, 1], limits)
-            speeds[robot, 0] = min(max(left, speeds[robot, 0] - change), speeds[robot, 0] + change)
-            speeds[robot, 1] = min(max(right, speeds[robot, 1] - change), speeds[robot, 1] + change)
+            to = limited(wanted[robot, 0], wanted[robot, 1], limits)
+            now = speeds[robot, 0], speeds[robot, 1]
+            speeds[robot, 0], speeds[robot, 1] = changed(
+                now, to, limits, limits.acceleration, time_step
+            )
 
 
 @njit
@@ -122,13 +160,11 @@ def drive_orders(
     for order in range(times.shape[0]):
         if times[order] <= 0.0:
             continue
-        to_left, to_right = limited(orders[order, 0], orders[order, 1], limits)
+        to = limited(orders[order, 0], orders[order, 1], limits)
         parts = math.ceil(times[order] / time_step - 1e-9)
         part = times[order] / parts
-        change = limits.acceleration * part
         for _ in range(parts):
-            left = min(max(to_left, left - change), left + change)
-            right = min(max(to_right, right - change), right + change)
+            left, right = changed((left, right), to, limits, limits.acceleration, part)
             turn, along = (right - left) / wheel_base * part, 0.5 * (left + right) * part
             x += along * math.cos(heading + 0.5 * turn)
             y += along * math.sin(heading + 0.5 * turn)

@@ -77,6 +77,10 @@ class _Reader(NodeReader):
         """Read the value of a key."""
         if key == "name":
             return self.text(node, key)
+        if key == "reverse":
+            if (word := self.text(node, key).lower()) not in ("true", "false"):
+                raise self.error(node, f"{key} must be true or false, got {word!r}")
+            return word == "true"
         if key == "lidar_mount":
             return [self.number(each, key, "") for each in self.items(node, key)]
         value = self.number(node, key, "" if key == "lidar_rays" else f" in {MEANT[key][2]}")

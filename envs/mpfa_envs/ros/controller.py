@@ -21,6 +21,7 @@ from mpfa_envs.ros.inputs import Felt, Seen, Sight, Track
 if TYPE_CHECKING:
     from mpfa_envs.deploy.pilot import Command, Pilot
     from mpfa_envs.deploy.sectors import Scan
+    from mpfa_envs.worlds.world import World
 
 _EARLY: Final = 0.2
 """Share of its period by which a decision may come early, as scans are irregular."""
@@ -69,6 +70,7 @@ class Controller:
         self._decided = -math.inf
         self._idle = "no goal"
         self._told = True
+        self._plan: tuple[World, tuple[float, float, float]] | None = None
 
     def see(self, scan: Scan, time: float) -> None:
         """Take a scan and its time [s]."""
@@ -82,8 +84,23 @@ class Controller:
         if lost and self.pilot.goal is not None:
             self.aim(None, lost)
 
-    def aim(self, goal: tuple[float, float] | None, reason: str = "no goal") -> None:
-        """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason."""
+    def know(self, plan: World | None, pose: tuple[float, float, float]) -> None:
+        """Take the plan for this and later goals, and its pose in the frame of the odometry."""
+        self._plan = None if plan is None else (plan, pose)
+        if plan is not None and self.pilot.plan is plan:
+            self.pilot.move_plan(pose)
+
+    def aim(
+        self,
+        goal: tuple[float, float] | None,
+        reason: str = "no goal",
+        *,
+        heading: float | None = None,
+    ) -> None:
+        """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason.
+
+        There the robot turns to a heading, if there is one [rad].
+        """
         self._command, self._told = None, False
         self._idle, self._held = reason, ""
         self._places, self._lost = set(), 0.0
@@ -93,15 +110,16 @@ class Controller:
         self.pilot.stop()
         if goal is not None:
             try:
-                self.pilot.begin(goal)
+                plan, pose = self._plan or (None, (0.0, 0.0, 0.0))
+                self.pilot.begin(goal, plan=plan, plan_pose=pose, heading=heading)
             except ValueError as error:
                 self._idle = str(error)
 
-    def correct_goal(self, goal: tuple[float, float]) -> None:
+    def correct_goal(self, goal: tuple[float, float], heading: float | None = None) -> None:
         """The goal in the frame of the odometry, which has drifted; NaN gives up the goal."""
         if self.pilot.goal is not None:
             try:
-                self.pilot.move_goal(goal)
+                self.pilot.move_goal(goal, heading=heading)
             except ValueError as error:
                 self.aim(None, str(error))
 

@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from mpfa_envs.deploy.sectors import Scan
+from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.world import World
+
+Pose = tuple[float, float, float]
+_OCCUPIED: Final = 65
+"""Chance in percent from which a cell is occupied."""
 
 
 def seconds(stamp: Any) -> float:
@@ -41,12 +49,24 @@ def odometry_of(message: Any) -> tuple[tuple[float, float, float], tuple[float, 
     return (place.x, place.y, yaw(pose.orientation)), (twist.linear.x, twist.angular.z)
 
 
-def transformed(place: tuple[float, float], transform: Any) -> tuple[float, float]:
-    """A place of the source frame in the target frame of a ``geometry_msgs/Transform``."""
+def transformed(pose: Pose, transform: Any) -> Pose:
+    """A pose of the source frame in the target frame of a ``geometry_msgs/Transform``."""
     turn, move = yaw(transform.rotation), transform.translation
     cosine, sine = math.cos(turn), math.sin(turn)
-    x, y = place
-    return cosine * x - sine * y + move.x, sine * x + cosine * y + move.y
+    x, y, heading = pose
+    return cosine * x - sine * y + move.x, sine * x + cosine * y + move.y, heading + turn
+
+
+def plan_of(message: Any) -> tuple[World, Pose]:
+    """A ``nav_msgs/OccupancyGrid`` as a plan, and the pose of its frame in that of the message.
+
+    Cells of 65 and more are occupied, as for map_server; unknown ones are not.
+    """
+    info, place = message.info, message.info.origin
+    cells = np.array(message.data, dtype=np.int16).reshape(info.height, info.width).T
+    grid = OccupancyGrid(np.ascontiguousarray(cells >= _OCCUPIED), float(info.resolution))
+    plan = World(name="map", size=grid.size, occupancy=grid)
+    return plan, (place.position.x, place.position.y, yaw(place.orientation))
 
 
 def write_pose(message: Any, pose: tuple[float, float, float]) -> None:

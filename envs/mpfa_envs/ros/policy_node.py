@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
@@ -20,7 +20,16 @@ from sensor_msgs.msg import LaserScan
 from mpfa_envs.checks import check_positive
 from mpfa_envs.deploy import Pilot
 from mpfa_envs.ros.controller import Controller
-from mpfa_envs.ros.messages import odometry_of, scan_of, seconds, transformed
+from mpfa_envs.ros.messages import (
+    Pose,
+    odometry_of,
+    plan_of,
+    scan_of,
+    seconds,
+    transformed,
+    yaw,
+)
+from mpfa_envs.worlds.world import World
 
 PARAMETERS: Final[dict[str, Any]] = {
     "policy": "",
@@ -32,6 +41,8 @@ PARAMETERS: Final[dict[str, Any]] = {
     "map_size": 40.0,
     "clearance": 0.0,
     "latency": -1.0,
+    "goal_radius": 0.0,
+    "goal_heading": True,
     "stop_distance": 0.05,
     "scan_timeout": 0.5,
     "odometry_timeout": 0.5,
@@ -43,6 +54,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "scan_topic": "scan",
     "odometry_topic": "odom",
     "goal_topic": "goal_pose",
+    "map_topic": "",
     "command_topic": "cmd_vel",
 }
 """The parameters with their defaults; docs/robot.md explains them."""
@@ -65,6 +77,7 @@ class PolicyNode(Node):
             unseen=value("unseen") or None,
             clearance=value("clearance") or None,
             latency=None if value("latency") < 0.0 else value("latency"),
+            goal_radius=value("goal_radius") or None,
             **options,
         )
         rate = check_positive("rate", value("rate"))
@@ -75,7 +88,9 @@ class PolicyNode(Node):
         self._base_frame = value("base_frame")
         self._transform_timeout = check_positive("transform_timeout", value("transform_timeout"))
         self._odometry_frame: str | None = None
-        self._goal: tuple[tuple[float, float], str] | None = None
+        self._goal: tuple[Pose, str] | None = None
+        self._plan: tuple[World, Pose, str] | None = None
+        self._turns = value("goal_heading") and pilot.turns_on_the_spot
         self._waits = ""
         self._stamp, self._stamped_at = -math.inf, -math.inf
         self._reason = ""
@@ -86,6 +101,11 @@ class PolicyNode(Node):
         sensor(LaserScan, value("scan_topic"), self._on_scan)
         sensor(Odometry, value("odometry_topic"), self._on_odometry)
         self.create_subscription(PoseStamped, value("goal_topic"), self._on_goal, 1)
+        if topic := value("map_topic"):
+            if pilot.card.memory != "map":
+                raise ValueError(f"map_topic must be '' for a policy without a map, got {topic!r}")
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.create_subscription(OccupancyGrid, topic, self._on_map, latched)
         self.create_timer(1.0 / rate, self._tick)
 
     def _value(self, name: str) -> Any:
@@ -120,19 +140,32 @@ class PolicyNode(Node):
         self.controller.feel(*odometry_of(message), self._time_of(message.header))
 
     def _on_goal(self, message: Any) -> None:
-        place = message.pose.position.x, message.pose.position.y
-        self._goal, self._waits = (place, message.header.frame_id), ""
+        heading = yaw(message.pose.orientation) if self._turns else math.nan
+        pose = message.pose.position.x, message.pose.position.y, heading
+        self._goal, self._waits = (pose, message.header.frame_id), ""
         self._stamp = self._stamped_at = -math.inf
         self.controller.aim(None)
         self._set_out()
         self._tick()
+
+    def _on_map(self, message: Any) -> None:
+        # A map that comes while the robot drives is for the next goal.
+        self._plan = (*plan_of(message), message.header.frame_id)
+
+    def _place_plan(self) -> None:
+        """Give the controller the plan, where localization has it."""
+        if self._plan is not None:
+            plan, pose, frame = self._plan
+            self.controller.know(plan, self._in_odometry(pose, frame))
 
     def _set_out(self) -> None:
         """Set out for the goal if its place is known; else it is tried again at each check."""
         if self._goal is None:
             return
         try:
-            self.controller.aim(self._in_odometry(*self._goal))
+            x, y, heading = self._in_odometry(*self._goal)
+            self._place_plan()
+            self.controller.aim((x, y), heading=None if math.isnan(heading) else heading)
         # What tf2 raises has no public base class.
         except Exception as error:
             reason = f"goal in frame {self._goal[1]!r}: {error}"
@@ -142,8 +175,8 @@ class PolicyNode(Node):
         else:
             self._waits = ""
 
-    def _in_odometry(self, place: tuple[float, float], frame: str) -> tuple[float, float]:
-        """Transform a place of another frame into that of the odometry."""
+    def _in_odometry(self, place: Pose, frame: str) -> Pose:
+        """Transform a pose of another frame into that of the odometry."""
         if frame in ("", self._odometry_frame):
             return place
         if self._transforms is None:
@@ -159,11 +192,14 @@ class PolicyNode(Node):
         return transformed(place, found.transform)
 
     def _correct(self) -> None:
-        """Update the goal by the newest transform; an old one keeps the robot from driving."""
-        if self._goal is None or self._goal[1] in ("", self._odometry_frame):
+        """Update goal and plan by the newest transform; an old one keeps the robot standing."""
+        frames = {placed[-1] for placed in (self._goal, self._plan) if placed}
+        if self._goal is None or not frames - {"", self._odometry_frame}:
             return
         try:
-            self.controller.correct_goal(self._in_odometry(*self._goal))
+            x, y, heading = self._in_odometry(*self._goal)
+            self._place_plan()
+            self.controller.correct_goal((x, y), None if math.isnan(heading) else heading)
         # As above; a correction that fails once is made later.
         except Exception as error:
             warn = self.get_logger().warning

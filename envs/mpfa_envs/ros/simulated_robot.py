@@ -113,11 +113,16 @@ class SimulatedRobot:
         self.touched = self.touched or clearance <= self.robot.radius
 
     def scan(self) -> Scan:
-        """Measure with the lidar at the robot's center."""
+        """Measure with the lidar, where the robot has it."""
         x, y, heading, *_ = self.motion
         (first, last), far = self._field, self._lidar.max_range
-        heading += 0.5 * (first + last)
-        ranges = self._lidar.measure(x, y, heading, rng=self._rng)[::-1]
+        across, up, yaw, roll = (*self.robot.lidar_mount, 0.0)[:4]
+        x += across * math.cos(heading) - up * math.sin(heading)
+        y += across * math.sin(heading) + up * math.cos(heading)
+        side = 1.0 if abs(roll) < 1.0 else -1.0
+        heading += yaw + side * 0.5 * (first + last)
+        ranges = self._lidar.measure(x, y, heading, rng=self._rng)
+        ranges = ranges[::-1] if side > 0.0 else ranges
         step = (last - first) / (len(ranges) - 1)
         return Scan(first, step, np.where(ranges >= far, math.inf, ranges), 0.0, far)
 

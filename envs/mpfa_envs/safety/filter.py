@@ -31,6 +31,10 @@ class SafetyFilter:
     place of any other action the nearest admissible one of a grid is taken; if there is none, the
     robot brakes, or turns.
 
+    A robot that can stop needs a lidar that sees 180 degrees: beside a narrower view it would meet
+    what it never saw. What a lidar before or behind the axle does not see at the robot's sides, in
+    front of the axle, counts as seen before.
+
     It is a function of the observation and the action alone, so that every driver can have it:
     a policy, a planner, a training and a robot. :meth:`mpfa_envs.TaskConfig.make_filter` makes the
     one of a task.
@@ -38,7 +42,7 @@ class SafetyFilter:
     Args:
         robot: A :class:`~mpfa_envs.RobotModel`, or a name in :data:`~mpfa_envs.ROBOTS`.
         angles: Directions of the lidar's rays in the robot's frame, left to right [rad], ``[R]``;
-            :attr:`mpfa_envs.Lidar.angles`.
+            :attr:`mpfa_envs.Lidar.angles`. Rays begin at the robot's ``lidar_mount``.
         sectors: Number of its sectors, which share the rays.
         max_range: Range of a sector that meets nothing [m].
         closeness_distance: A range of this or less has closeness one [m].
@@ -52,8 +56,8 @@ class SafetyFilter:
         braking: Share of the wheels' acceleration with which they slow down at least.
 
     Raises:
-        ValueError: If a number is out of its range, or the robot takes farther than it sees to
-            stand still.
+        ValueError: If a number is out of its range, the robot can stop and sees less than 180
+            degrees, or it takes farther than it sees to stand still.
 
     Examples:
         >>> import numpy as np
@@ -90,8 +94,21 @@ class SafetyFilter:
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
         self._rays = len(angles) // sectors
-        unseen = _unseen(angles) if self.robot.can_stop else np.empty(0)
+        mount, radius = np.array(self.robot.lidar_mount[:2]), self.robot.radius
+        unseen = np.empty(0)
+        if self.robot.can_stop:
+            view = math.degrees(float(np.ptp(angles)) * len(angles) / max(len(angles) - 1, 1))
+            if view < 180.0 - 1e-6:
+                raise ValueError(
+                    "field_of_view must be at least 180 degrees for a filter, behind which "
+                    f"{self.robot.name!r} would never drive ahead, got {view:.4g}: take a lidar "
+                    "that sees more, or drive without the filter (environment.filter=0)"
+                )
+            unseen = _unseen(angles, mount, radius)
         self._unseen = len(unseen)
+        self._rims = _to_rim(angles, mount, radius)
+        self._origins = np.zeros((2, len(angles) + len(unseen)))
+        self._origins[:, : len(angles)] = mount[:, None]
         around = np.concatenate((angles, unseen))
         self._directions = np.stack((np.cos(around), np.sin(around)))
         self._max_range = check_positive("max_range", max_range)
@@ -106,7 +123,8 @@ class SafetyFilter:
             check_positive("braking", check_share("braking", braking))
             * self.robot.wheel_limits.acceleration,
         )
-        if self.robot.can_stop and (reach := _reach(self._body)) > self._max_range:
+        reach = _reach(self._body) + math.hypot(*mount)
+        if self.robot.can_stop and reach > self._max_range:
             raise ValueError(
                 f"max_range must be at least {reach:.3g} m, within which {self.robot.name} "
                 f"decides and stops from its greatest speed, got {max_range}"
@@ -164,6 +182,7 @@ class SafetyFilter:
             actions,
             self._ranges(rows).reshape(len(actions), -1, self._directions.shape[1]),
             self._directions,
+            self._origins,
             self._wheel_speeds(rows).reshape(len(actions), -1, 2),
             self._candidates,
             self._body,
@@ -177,13 +196,14 @@ class SafetyFilter:
     def _ranges(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Ranges of all rays [m], ``[N, R]``: each may be the one that its sector reports."""
         closeness = rows[:, self._parts["lidar"]]
+        closeness = np.repeat(closeness, self._rays, axis=1)
         ranges = self._near / np.maximum(closeness, 1e-9)
         # An obstacle nearer than the observation can show may be at the rim.
-        ranges[closeness >= 1.0] = min(self._near, self.robot.radius)
+        ranges = np.where(closeness >= 1.0, np.minimum(self._near, self._rims), ranges)
         ranges[ranges >= 0.999 * self._max_range] = math.inf
         # What is not seen begins at the rim, which may leave it but not approach it.
         unseen = np.full((len(rows), self._unseen), self.robot.radius)
-        return np.concatenate((np.repeat(ranges, self._rays, axis=1), unseen), axis=1)
+        return np.concatenate((ranges, unseen), axis=1)
 
     def _wheel_speeds(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Speeds of the wheels [m/s], ``[N, 2]``."""
@@ -194,12 +214,30 @@ class SafetyFilter:
         return np.concatenate((forward - across, forward + across), axis=1)
 
 
-def _unseen(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions, every 10 degrees or so, between the last and the first sector [rad]."""
+def _to_rim(
+    angles: NDArray[np.float64], mount: NDArray[np.float64], radius: float
+) -> NDArray[np.float64]:
+    """Distance of the rim from the lidar in some directions [m]."""
+    along = mount[0] * np.cos(angles) + mount[1] * np.sin(angles)
+    return np.sqrt(np.maximum(along * along + radius**2 - mount @ mount, 0.0)) - along
+
+
+def _unseen(
+    angles: NDArray[np.float64], mount: NDArray[np.float64], radius: float
+) -> NDArray[np.float64]:
+    """Directions, every 10 degrees or so, of the rim that the lidar does not see [rad]."""
     first, last = float(angles.min()), float(angles.max())
     step = (last - first) / max(len(angles) - 1, 1)
-    gap = math.tau - (last - first) - step
-    return np.linspace(last + 0.5 * step, last + 0.5 * step + gap, 2 + round(gap / _STEP))[1:-1]
+    begin, gap = last + 0.5 * step, math.tau - (last - first) - step
+    if mount.any() and round(gap / _STEP) > 0:
+        ends = np.array([begin, begin + gap])
+        reach = _to_rim(ends, mount, radius)
+        off = np.arctan2(mount[1] + reach * np.sin(ends), mount[0] + reach * np.cos(ends))
+        left, right = float(off[0]), float(off[1]) + math.tau * (off[1] < off[0])
+        if gap <= math.pi + _STEP:
+            left, right = max(left, 0.5 * math.pi), min(right, 1.5 * math.pi)
+        begin, gap = left, right - left
+    return np.linspace(begin, begin + gap, 2 + round(gap / _STEP))[1:-1]
 
 
 def _reach(body: Body) -> float:

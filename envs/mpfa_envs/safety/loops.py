@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mpfa_envs.compiled import njit
-from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
+from mpfa_envs.robots.motion_loops import WheelLimits, changed, scale_actions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,6 +54,7 @@ def filter_actions(
     # hit nothing.
     ranges: NDArray[np.float64],
     directions: NDArray[np.float64],  # of the rays, cosine and sine, [2, R]
+    origins: NDArray[np.float64],  # of the rays, x and y in the robot's frame [m], [2, R]
     speeds: NDArray[np.float64],  # of the wheels in each state [m/s], [N, S, 2]
     candidates: NDArray[np.float64],  # actions to choose among, [K, 2]; the last one is safe
     body: Body,
@@ -71,7 +72,7 @@ def filter_actions(
         chosen[robot] = actions[robot]
         for state in range(states):
             counts[state] = _near_points(
-                ranges[robot, state], directions, speeds[robot, state], body, points[state]
+                ranges[robot, state], directions, origins, speeds[robot, state], body, points[state]
             )
         # Real wheels creep while they are told to stand: what has come too near is left.
         nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
@@ -109,6 +110,7 @@ def filter_actions(
 def _near_points(
     ranges: NDArray[np.float64],
     directions: NDArray[np.float64],
+    origins: NDArray[np.float64],
     speeds: NDArray[np.float64],
     body: Body,
     points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
@@ -123,14 +125,19 @@ def _near_points(
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
-        if ranges[ray] <= reach + kept:
-            points[count, 0] = ranges[ray] * directions[0, ray]
-            points[count, 1] = ranges[ray] * directions[1, ray]
+        x = origins[0, ray] + ranges[ray] * directions[0, ray]
+        y = origins[1, ray] + ranges[ray] * directions[1, ray]
+        away = ranges[ray]
+        if origins[0, ray] != 0.0 or origins[1, ray] != 0.0:
+            away = math.hypot(x, y)
+        if away <= reach + kept:
+            points[count, 0] = x
+            points[count, 1] = y
             # What is nearer already may come nearer by a share of what is left, which lets the
             # robot pass by it, but not nearer than the least.
-            left = (1.0 - _SHARE) * (ranges[ray] - body.radius)
+            left = (1.0 - _SHARE) * (away - body.radius)
             left = max(left, _LEAST * body.clearance)
-            distance = min(ranges[ray], kept, body.radius + left) - _TOUCH
+            distance = min(away, kept, body.radius + left) - _TOUCH
             points[count, 2] = distance * distance
             count += 1
     return count
@@ -168,9 +175,8 @@ def _room_after_from(
     x, y, heading = 0.0, 0.0, 0.0
     step = 0
     while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
-        to_left, to_right = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
-        left = _changed(left, to_left, body)
-        right = _changed(right, to_right, body)
+        wanted = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
+        left, right = changed((left, right), wanted, body.limits, body.braking, body.time_step)
         part = body.time_step / _PARTS
         turn = (right - left) / body.wheel_base * part
         along = 0.5 * (left + right) * part
@@ -191,14 +197,6 @@ def _room_after_from(
     to_left = _nearest(x - across, y + along, points, 0.0)
     free = max(to_left, _nearest(x + across, y - along, points, 0.0))
     return free if free >= kept else -1.0
-
-
-@njit
-def _changed(speed: float, wanted: float, body: Body) -> float:
-    """The speed of a wheel after a time step [m/s]."""
-    slows_down = abs(wanted) < abs(speed) or wanted * speed < 0.0
-    change = (body.braking if slows_down else body.limits.acceleration) * body.time_step
-    return min(max(wanted, speed - change), speed + change)
 
 
 @njit

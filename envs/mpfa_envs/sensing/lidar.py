@@ -17,6 +17,7 @@ from mpfa_envs.checks import (
     check_choice,
     check_count,
     check_not_negative,
+    check_number,
     check_positive,
     check_share,
 )
@@ -55,6 +56,7 @@ class Lidar:
         field_of_view: Angle from the first edge of the first sector to the last of the last one
             [deg], at most 360: of sectors of 10 degrees a whole turn has 36.
         dropout: Chance that a ray reports the greatest range.
+        mount: Position (x, y) of the sensor in the robot's frame, where rays begin [m].
 
     Raises:
         ValueError: If a number is out of its range or the reduction is unknown.
@@ -77,6 +79,7 @@ class Lidar:
         noise: float = 0.0,
         field_of_view: float = 180.0,
         dropout: float = 0.0,
+        mount: tuple[float, ...] = (0.0, 0.0),
     ) -> None:
         self.sectors = check_count("sectors", sectors)
         count = check_count("rays_per_sector", rays_per_sector)
@@ -86,6 +89,7 @@ class Lidar:
         self.noise = check_not_negative("noise", noise)
         self.field_of_view = check_positive("field_of_view", field_of_view)
         self.dropout = check_share("dropout", dropout)
+        self.mount = check_number("mount", mount[0]), check_number("mount", mount[1])
         rays = check_count("sectors * rays_per_sector", self.sectors * self.rays_per_sector)
         self.angles = ray_angles(self.field_of_view, rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
@@ -103,8 +107,8 @@ class Lidar:
         """Measure every ray without noise.
 
         Args:
-            x: Position of the sensor [m].
-            y: Position of the sensor [m].
+            x: Position of the robot's center [m].
+            y: Position of the robot's center [m].
             heading: Direction of the robot's front [rad].
             moving: Circles (x, y, radius) that are not of the world [m], shape ``[K, 3]``.
 
@@ -137,8 +141,28 @@ class Lidar:
             rooms: The room of each robot.
             ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
         """
-        view = math.radians(self.field_of_view)
+        view, motions = math.radians(self.field_of_view), self.placed(motions)
         cast_rays(motions, chosen, rooms, self._directions, view, self.max_range, ranges)
+
+    def placed(self, motions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses of the sensors of many robots, in the first three columns as for the robots."""
+        x, y = self.mount
+        if not (x or y):
+            return motions
+        placed, cosine, sine = motions.copy(), np.cos(motions[:, 2]), np.sin(motions[:, 2])
+        placed[:, 0] += x * cosine - y * sine
+        placed[:, 1] += x * sine + y * cosine
+        return placed
+
+    def around_center(
+        self, ranges: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Angles [rad] and distances [m] of the ends of rays, ``[rays]``, from the center."""
+        x, y = self.mount
+        if not (x or y):
+            return self.angles, ranges
+        across, up = self._directions * ranges
+        return np.arctan2(y + up, x + across), np.hypot(x + across, y + up)
 
     def scan(
         self, x: float, y: float, heading: float, *, rng: np.random.Generator | None = None
@@ -146,8 +170,8 @@ class Lidar:
         """Measure the range of every sector.
 
         Args:
-            x: Position of the sensor [m].
-            y: Position of the sensor [m].
+            x: Position of the robot's center [m].
+            y: Position of the robot's center [m].
             heading: Direction of the robot's front [rad].
             rng: Source of the noise; needed only if there is noise.
 
@@ -171,8 +195,8 @@ class Lidar:
         """Measure the range of every ray, with noise.
 
         Args:
-            x: Position of the sensor [m].
-            y: Position of the sensor [m].
+            x: Position of the robot's center [m].
+            y: Position of the robot's center [m].
             heading: Direction of the robot's front [rad].
             rng: Source of the noise; needed only if there is noise.
             moving: As in :meth:`cast`.

@@ -64,6 +64,7 @@ def remember(
     maps: MapArrays,
     # [m]: a cell, up to where cells are blocked, tight and near, max_range
     lengths: tuple[float, float, float, float, float],
+    mount: tuple[float, float],  # of the lidar in the robot's frame [m]
     paths: NDArray[np.float64],  # direction (x, y) in the robot's frame and length [m], [N, 3]
 ) -> None:
     """Enter a scan of the chosen robots in their maps, and find the paths to their goals."""
@@ -79,13 +80,15 @@ def remember(
         u = (taken[robot, 0] - maps.origins[robot, 0]) / resolution
         v = (taken[robot, 1] - maps.origins[robot, 1]) / resolution
         cosine, sine = math.cos(taken[robot, 2]), math.sin(taken[robot, 2])
+        from_u = u + (mount[0] * cosine - mount[1] * sine) / resolution
+        from_v = v + (mount[0] * sine + mount[1] * cosine) / resolution
         changed = False
         for ray in range(ranges.shape[1]):
             if ranges[robot, ray] < max_range:
                 reach = ranges[robot, ray] / resolution
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
-                changed |= _enter(levels, u + reach * across, v + reach * up, bounds)
+                changed |= _enter(levels, from_u + reach * across, from_v + reach * up, bounds)
         x, y, heading = motions[robot, 0], motions[robot, 1], motions[robot, 2]
         cosine, sine = math.cos(heading), math.sin(heading)
         u = (x - maps.origins[robot, 0]) / resolution

@@ -40,7 +40,7 @@ class Sketch(NamedTuple):
 
 
 class MapMemory:
-    """A map for each of many robots, empty when an episode begins.
+    """A map for each of many robots, empty when an episode begins, or as a plan says.
 
     The map has square cells. Where the robot's center cannot be, as its rim would touch a point
     that the lidar hit, a cell is blocked; unseen cells count as free. The path is the cheapest one
@@ -49,12 +49,14 @@ class MapMemory:
     costlier. Its direction is that of the farthest of its next cells, two meters away at most, to
     which a straight line is no narrower than its ends.
 
-    It knows of the room only the scans, entered at the poses that odometry gives.
+    It knows of the room only the scans, entered at the poses that odometry gives, and its plan if
+    it is given. Scans add what the plan does not have; what it has too much stays, at the cost of
+    blocked cells.
 
     Args:
         count: Number of robots N.
         robot: Robot whose radius decides where its center fits.
-        lidar: The robots' lidar; its ``angles`` and ``max_range`` count.
+        lidar: The robots' lidar; its ``angles``, ``max_range`` and ``mount`` count.
 
     Examples:
         >>> from mpfa_envs import Box, Lidar, World
@@ -81,13 +83,24 @@ class MapMemory:
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         bounds = robot.radius, robot.radius + _TIGHT, robot.radius + _NEAR
         self._lengths = RESOLUTION, *bounds, lidar.max_range
+        self._mount = lidar.mount
 
-    def begin(self, index: int, world: World) -> None:
+    def begin(
+        self,
+        index: int,
+        world: World,
+        *,
+        plan: World | None = None,
+        pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         """Clear a robot's map.
 
         Args:
             index: Number of the robot.
             world: Room of its next episode, for whose ``size`` the map is made.
+            plan: What is known: cells have the levels that hits on all of its obstacles and walls
+                would give them; None: nothing.
+            pose: Of the plan's origin in the room (x, y, heading) [m, m, rad].
         """
         sides = [math.ceil(side / RESOLUTION) + 2 * _MARGIN for side in world.size]
         arrays = self.arrays
@@ -97,6 +110,15 @@ class MapMemory:
         arrays.origins[index] = [-(side - 1) / 2 * RESOLUTION for side in sides]
         arrays.levels[index] = 0
         arrays.costs[index] = UNKNOWN
+        if plan is not None:
+            cells = np.indices(sides).reshape(2, -1).T
+            x, y = (arrays.origins[index] + RESOLUTION * cells - pose[:2]).T
+            cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+            points = np.stack((x * cosine + y * sine, y * cosine - x * sine), axis=1)
+            clearance = plan.clearances(points).reshape(sides)
+            levels[index, : sides[0], : sides[1]] = sum(
+                (clearance <= bound).astype(np.uint8) for bound in self._lengths[1:4]
+            )
         self._paths[index] = 0.0
 
     def remember(
@@ -128,8 +150,8 @@ class MapMemory:
             chosen = np.ones(len(motions), dtype=np.bool_)
         directions = self._directions if directions is None else directions
         taken = motions if taken is None else taken
-        scans = goals, ranges, chosen, directions
-        remember(motions, taken, *scans, self.arrays, self._lengths, self._paths)
+        how = self.arrays, self._lengths, self._mount
+        remember(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
 
     def sketch(self, index: int, x: float, y: float) -> Sketch:

@@ -111,6 +111,13 @@ def _sector_range(rays: NDArray[np.float64], first: int, count: int, median: boo
 
 
 @njit
+def lidar_pose(pose: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
+    """The pose, ``[3]``, of a lidar that a robot has at a place (x, y) in its frame [m]."""
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    return np.array((pose[0] + x * cosine - y * sine, pose[1] + x * sine + y * cosine, pose[2]))
+
+
+@njit
 def look_from(
     pose: NDArray[np.float64],  # x, y, heading first [m, m, rad], [3]
     angles: NDArray[np.float64],  # of the rays in the robot's frame [rad], [P]

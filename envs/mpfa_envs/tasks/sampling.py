@@ -14,8 +14,8 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
-from mpfa_envs.robots.model import PAPER_CLEARANCE
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.tasks.doors import cell_share, kept_in, warn_of_parts
 from mpfa_envs.worlds.task import START_SLACK, Task
 from mpfa_envs.worlds.world import Box, World
 
@@ -68,7 +68,7 @@ def sample_task(
         (3, 2)
     """
     asked = {"min_goal_distance": min_goal_distance, "detour_chance": detour_chance}
-    grid = grid_for(world, collision_distance)
+    grid = grid_for(world, collision_distance, cell_share(world))
     if is_wide(world):
         return sample_task_on_grid(grid, rng, **asked)[0]
     try:
@@ -210,8 +210,9 @@ def evaluation_pairs(
         world: A name, the path of a YAML file or a world.
         n: Number of tasks.
         seed: Seed of the sampling; the first tasks of a longer list are those of a shorter one.
-        robot: The robot, whose rim keeps the paper's clearance of 0.17 m at the start, at the goal
-            and on a path between them, for any clearance of its training.
+        robot: The robot, whose rim keeps a clearance at the start, at the goal and on a path
+            between them, for any clearance of its training: the paper's 0.17 m in worlds that have
+            a name, 0.03 m in others, where doors may be 0.1 m wider than the robot.
         min_goal_distance: Least distance between start and goal [m].
 
     Returns:
@@ -219,6 +220,9 @@ def evaluation_pairs(
 
     Raises:
         ValueError: If n or the seed is out of its range, or the world has no room for a task.
+
+    Warns:
+        UserWarning: If parts of a world without a name cannot be reached from its largest one.
 
     Examples:
         >>> from mpfa_envs import NavigationEnv
@@ -234,7 +238,8 @@ def evaluation_pairs(
     world = resolve_world(world)
     robot = resolve_robot(robot)
     # Not the distance of training: settings may change it, and the tasks must stay the same.
-    distance = round(robot.radius + PAPER_CLEARANCE, 9)
+    distance = round(robot.radius + kept_in(world), 9)
+    warn_of_parts(world, robot, kept_in(world))
     # An environment with the same seed must not train on these tasks.
     rng = np.random.default_rng((_EVALUATION_STREAM, seed))
     return [

@@ -14,7 +14,7 @@ import torch
 from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
-from training.environments import make_training_env, task_arguments
+from training.environments import FilteredRobots, make_training_env, task_arguments
 from training.evaluating import check_physics
 from training.plugins import OF_LOSSES, SIGNALS
 from training.settings.environment import EnvironmentSettings
@@ -39,6 +39,8 @@ def check_settings(settings: TrainSettings) -> None:
         if is_dataclass(group):
             check_rules(group, rules_of(type(group)), f"{entry.name}.")
     _check_environment(settings.environment, hindsight=settings.method.hindsight > 0)
+    with named("environment."):
+        FilteredRobots(settings)
     _check_stages(settings)
     _check_evaluation(settings)
     _check_method(settings.method)
@@ -60,6 +62,8 @@ def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> 
         RobotNoise(**asdict(environment.noise))
     with named("environment."):
         task = TaskConfig(**task_arguments(environment))
+        if environment.mirror:
+            task.make_mirror()
         if hindsight:
             GoalRelabeling(task)
 

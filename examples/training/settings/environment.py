@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from mpfa_envs import TaskConfig
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE
 from training.settings.rules import at_least, between, setting
 
@@ -52,6 +53,8 @@ class EnvironmentSettings:
     progress: str = "straight_line"
     """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or ``none``:
     goal and collision alone."""
+    goal_radius: float = setting(TaskConfig.goal_radius, between(0.1, 1.5, "from 0.1 to 1.5 [m]"))
+    """Distance from the goal at which the robot has arrived [m]."""
     max_goal_distance: float | None = setting(None, POSITIVE)
     """Longest path of a sampled task [m]; null: no limit."""
     episodes_per_world: int = setting(1, at_least(1))
@@ -59,6 +62,9 @@ class EnvironmentSettings:
     memory: str = "none"
     """``map``: the robot observes the path to the goal on a map of its lidar's hits; ``none``: the
     current scan alone."""
+    plan: str = "unknown"
+    """``known``: the robot's map begins with all obstacles and walls that stand; ``unknown``: it
+    begins empty. A policy that learned without a plan drives with it as well."""
     history: int = setting(0, at_least(0))
     """Earlier scans in the observation, which show what moves."""
     field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from mpfa_envs import EXAMPLE_ROBOT, evaluate, load_policy, load_robot
+from mpfa_envs import EXAMPLE_ROBOT, TaskConfig, evaluate, load_policy, load_robot
 from mpfa_envs.robots.resolve import resolve_robot
 from tests.integration.tiny_runs import OVERRIDES, go_on, rows, stop_after, tiny, train
+from training.environments import env_arguments
 from training.run.checkpoints import read_checkpoint
 from training.run.script import write_settings
 from training.settings.command_line import composed
@@ -57,6 +58,43 @@ def test_an_error_in_the_file_names_the_setting_and_the_line(tmp_path: Path) -> 
         asked(file)
     with pytest.raises(ValueError, match=r"environment.robot: .*none.yaml: cannot be read"):
         asked(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "view: 360",
+            "view: 90",
+            r"environment.field_of_view must be at least 180 degrees for a f",
+        ),
+        ("[0.1, 0.0", "[0.1, 0.05", "environment.mirror must be False for 'cart', whose lidar is"),
+    ],
+)
+def test_a_lidar_that_does_not_fit_the_training_is_named_before_it_starts(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "cart.yaml"
+    text = EXAMPLE_ROBOT.read_text(encoding="utf-8").replace(old, new)
+    file.write_text(text, encoding="utf-8")
+    register()
+    words = [f"environment.robot={file}", "regime=rooms", "learner=td3", "actions=100"]
+    with pytest.raises(ValueError, match=message):
+        next(iter(composed(words)))
+    for settings in composed([*words, "environment.filter=0", "environment.mirror=false"]):
+        assert settings.environment.filter == 0.0
+
+
+def test_a_policy_asks_for_plan_and_goal_radius_where_they_are_not_the_defaults() -> None:
+    register()
+    words = ["regime=rooms", "learner=td3", "actions=100"]
+    for more, asked in (([], {}), (["plan=known", "goal_radius=0.1"], {"plan", "goal_radius"})):
+        (settings,) = composed([*words, *(f"environment.{each}" for each in more)])
+        arguments = env_arguments(settings.environment)
+        assert arguments.keys() & {"plan", "goal_radius"} == set(asked)
+        assert TaskConfig(**arguments).goal_radius == (0.1 if more else 0.5)
+    with pytest.raises(ValueError, match=r"environment.goal_radius must be from 0.1 to 1.5"):
+        next(iter(composed([*words, "environment.goal_radius=0.05"])))
 
 
 def test_a_run_resumes_and_its_policy_drives_without_the_file(tmp_path: Path) -> None:
