@@ -334,14 +334,6 @@ def test_a_body_that_does_not_reverse_turns_on_the_spot(clearance: float | None)
     assert command[2:] == pytest.approx((0.0, 0.7 * 0.2 / 0.23))
 
 
-def test_wheels_that_do_not_turn_backwards_stand_where_the_scan_does_not_look() -> None:
-    robot = replace(KOBUKI, min_wheel_speed=0.0)
-    made = Pilot(card(**ALL_ROUND | {"robot": robot}), lambda _: np.array([(0.5, 0.2)]), unseen=0.3)
-    made.begin((4.0, 0.0))
-    scan = Scan(-0.5, math.pi / 180, np.full(57, 3.0))
-    assert made.decide(scan, (0.0, 0.0, 0.0), (0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
-
-
 def drive_to(pilot: Pilot, start: tuple[float, float, float], timeout: float = 60.0) -> Any:
     """Drive in an empty hall until the pilot says that it has arrived; the last motion."""
     drives, tick = KinematicDrives(pilot.robot, 1, time_step=0.02), 0.02

@@ -122,7 +122,7 @@ def test_cells_that_may_be_meant_are_not_warned_of(
 
 @pytest.mark.parametrize("size", [(1.8, 1.2), (30.0, 1.2)])
 def test_a_room_without_a_task_is_described(size: tuple[float, float]) -> None:
-    text = rf"in a room of {size[0]:g} x 1.2 m, of whose cells \d+\.\d% are 0.35 m from"
+    text = rf"in a room of {size[0]:g} x 1.2 m, of whose cells \d+\.\d% are 0.21 m from"
     with pytest.raises(ValueError, match=text):
         evaluation_pairs(World(name="narrow", size=size), 1, 0, min_goal_distance=40.0)
 

@@ -5,11 +5,42 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from mpfa_envs.checks import check_share
+from mpfa_envs.deploy.card import CardError
+
 if TYPE_CHECKING:
     from mpfa_envs.robots.model import RobotModel
 
+_WIDER: Final = 0.01
+"""A robot's radius may exceed that in training by this [m]."""
 _BEYOND: Final = 0.02
 """Share of its speed range by which a wheel's command may exceed it."""
+
+
+def pace_of(robot: RobotModel, learned: RobotModel, pace: float | None) -> float:
+    """Check that a robot fits a policy of another one; its pace, by default as fast as it can."""
+    if robot.radius > learned.radius + _WIDER:
+        raise CardError(
+            f"the policy learned with a robot of radius {learned.radius} m, "
+            f"{robot.name} has {robot.radius} m"
+        )
+    most = fastest_pace(robot, learned)
+    chosen = most if pace is None else check_share("pace", pace)
+    if not 0.0 < chosen <= most:
+        raise ValueError(
+            f"pace must be above 0 and at most {most:.3g}, as {robot.name} drives "
+            f"{robot.max_wheel_speed} m/s, turns by {robot.max_angular_speed:.3g} "
+            f"rad/s and changes its wheels' speed by {robot.wheel_limits.acceleration} "
+            f"m/s², got {pace}"
+        )
+    least = chosen * wheel_range(robot, learned)[0]
+    if least < robot.min_wheel_speed - tolerance(robot):
+        raise CardError(
+            f"on the sharpest arcs of the policy a wheel of {robot.name} would turn at "
+            f"{least:.3g} m/s, its min_wheel_speed is {robot.min_wheel_speed}: train a "
+            "policy with it, or give a lower min_wheel_speed if its wheels can do that"
+        )
+    return chosen
 
 
 def widening(robot: RobotModel, learned: RobotModel) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -13,18 +12,17 @@ from mpfa_envs.checks import (
     check_not_negative,
     check_number,
     check_positive,
-    check_share,
 )
-from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
+from mpfa_envs.deploy.arrival import Arrival
+from mpfa_envs.deploy.card import Card, check_finite, read_exported
+from mpfa_envs.deploy.keeping_off import filter_of
 from mpfa_envs.deploy.network import Network
-from mpfa_envs.deploy.pace import fastest_pace, tolerance, turning, wheel_range, widening
+from mpfa_envs.deploy.pace import pace_of, tolerance
 from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
 from mpfa_envs.deploy.way_back import WayBack
 from mpfa_envs.robots.motion_loops import changed
-from mpfa_envs.robots.orders import STRENGTH, Orders
+from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.safety.filter import SafetyFilter
-from mpfa_envs.sensing.lidar import ray_angles
 from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
 
 if TYPE_CHECKING:
@@ -36,22 +34,10 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.map_path import MapPath, Plan
     from mpfa_envs.worlds.world import World
 
-_WIDER: Final = 0.01
-"""A robot's radius may exceed that in training by this [m]."""
-_RAYS: Final = 5
-"""Directions of a sector, any of which may be the one of the range that it reports."""
-_PARTS: Final = 5
-"""Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
 _BESIDE: Final = 0.01
 """Cosine above which a direction is ahead."""
-_FACING: Final = math.radians(5.0)
-"""Error of the heading at a goal [rad]."""
-_STANDS: Final = 0.03
-"""Speed below which a robot stands, and may turn at the goal [m/s]."""
-_LAST: Final = 0.02
-"""Distance from the goal below which the robot drives no more slowly [m]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
@@ -130,38 +116,17 @@ class Pilot:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
         learned = card.robot
-        if self.robot.radius > learned.radius + _WIDER:
-            raise CardError(
-                f"the policy learned with a robot of radius {learned.radius} m, "
-                f"{self.robot.name} has {self.robot.radius} m"
-            )
-        most = fastest_pace(self.robot, learned)
-        self.pace = most if pace is None else check_share("pace", pace)
-        if not 0.0 < self.pace <= most:
-            raise ValueError(
-                f"pace must be above 0 and at most {most:.3g}, as {self.robot.name} drives "
-                f"{self.robot.max_wheel_speed} m/s, turns by {self.robot.max_angular_speed:.3g} "
-                f"rad/s and changes its wheels' speed by {self.robot.wheel_limits.acceleration} "
-                f"m/s², got {pace}"
-            )
-        least = self.pace * wheel_range(self.robot, learned)[0]
-        if least < self.robot.min_wheel_speed - tolerance(self.robot):
-            raise CardError(
-                f"on the sharpest arcs of the policy a wheel of {self.robot.name} would turn at "
-                f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
-                "policy with it, or give a lower min_wheel_speed if its wheels can do that"
-            )
+        self.pace = pace_of(self.robot, learned, pace)
         self.latency = self.robot.latency if latency is None else latency
         check_not_negative("latency", self.latency)
         mount = self.robot.lidar_mount if mount is None else mount
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)
-        self.goal_radius = card.goal_radius
-        if goal_radius is not None:
-            self.goal_radius = check_positive("goal_radius", goal_radius)
-        self._heading: float | None = None
-        self._there = False
+        self._arrival = Arrival(
+            self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
+        )
+        self.goal_radius = self._arrival.radius
         self._map: MapPath | None = None
         if card.memory == "map":
             # Imported here because it needs Numba, and compiled before the first decision is due.
@@ -174,7 +139,9 @@ class Pilot:
                 f"{learned.min_wheel_speed} m/s at least: no filter can promise that it touches "
                 f"nothing, got {clearance}"
             )
-        self._keep = None if clearance is None else self._filter(clearance)
+        self._keep = (
+            None if clearance is None else filter_of(card, self.robot, self.pace, clearance)
+        )
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._plan: Plan | None = None
@@ -226,7 +193,7 @@ class Pilot:
     @property
     def turns_on_the_spot(self) -> bool:
         """True if the robot can turn on the spot, as a heading at the goal needs."""
-        return self._spot_speed() > 0.0
+        return self._arrival.spot_speed > 0.0
 
     def begin(
         self,
@@ -272,9 +239,8 @@ class Pilot:
             placed = _placed(plan, plan_pose)
             center = placed.middle
         self._check_on_map(goal, center, placed)
-        self._heading = None if heading is None else check_number("heading", heading)
+        self._arrival.begin(heading)
         self._goal, self._center, self._plan, self._fresh = goal, center, placed, True
-        self._there = False
         self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
@@ -294,8 +260,8 @@ class Pilot:
         """
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
-        if heading is not None and self._heading is not None:
-            self._heading = check_number("heading", heading)
+        if heading is not None and self._arrival.heading is not None:
+            self._arrival.heading = check_number("heading", heading)
         if (goal := _pair("goal", goal)) != self._goal:
             self._check_on_map(goal, self._center, self._plan)
             self._goal = goal
@@ -323,13 +289,7 @@ class Pilot:
         """Return True if a pose is at the goal, with the heading that :meth:`begin` was given."""
         if self._goal is None:
             return False
-        # The robot takes a little way to stop.
-        near = (2.0 if self._there else 1.0) * self.goal_radius
-        there = math.dist(pose[:2], self._goal) <= near
-        if self._heading is None:
-            return there
-        self._there = there
-        return there and abs(math.remainder(self._heading - pose[2], math.tau)) <= _FACING
+        return self._arrival.is_at(pose, math.dist(pose[:2], self._goal))
 
     def observe(
         self,
@@ -457,12 +417,12 @@ class Pilot:
         Raises:
             ScanError: Also if it would drive where it does not see and cannot turn on the spot.
         """
-        if self._heading is not None and not self.arrived(pose) and self._there:
+        if not self.arrived(pose) and self._arrival.turns:
             self._time = self._time + self.period if time is None else time
-            return self._turn(self._heading - pose[2], speeds[0])
+            return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
         observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        slower = self._landing(pose)
+        slower = math.inf if self._goal is None else self._arrival.fastest(pose, self._goal)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
@@ -475,8 +435,9 @@ class Pilot:
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         backwards = left + right < 0.0 and not self.robot.reverse
         if backwards or (np.abs(towards) < _TOWARDS).any():
-            # Wheels that do not turn backwards cannot turn the robot on the spot: it stands.
-            most = max(min(learned.max_wheel_speed, -learned.min_wheel_speed), 0.0)
+            most = min(learned.max_wheel_speed, -learned.min_wheel_speed)
+            if most <= 0.0:
+                raise self._cannot_turn()
             right = min(max(0.5 * (right - left), -most), most)
             left = -right
         if self._keep is not None:
@@ -493,14 +454,18 @@ class Pilot:
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
 
+    def _cannot_turn(self) -> ScanError:
+        """The error of a robot that would drive where it does not see, and cannot look there."""
+        return ScanError(
+            "the scan must reach 45 degrees to both sides of where the robot drives, as with "
+            f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
+        )
+
     def _command(self, linear: float, angular: float) -> Command:
         """The command for speeds of the body [m/s, rad/s]."""
         turn = 0.5 * angular * self.robot.wheel_base
         if linear - abs(turn) < self.robot.min_wheel_speed - tolerance(self.robot):
-            raise ScanError(
-                "the scan must reach 45 degrees to both sides of where the robot drives, as with "
-                f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
-            )
+            raise self._cannot_turn()
         self.give(self._time, linear, angular)
         return Command(linear - turn, linear + turn, linear, angular)
 
@@ -508,37 +473,6 @@ class Pilot:
     def stands_still(self) -> bool:
         """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
         return self._way_back.stands_still
-
-    def _landing(self, pose: tuple[float, float, float]) -> float:
-        """Greatest speed of the policy's robot with which it stops at the goal [m/s]."""
-        as_learned = self._heading is None and self.goal_radius >= self.card.goal_radius
-        if self._goal is None or as_learned or not self.robot.can_stop:
-            return math.inf
-        away = math.dist(pose[:2], self._goal)
-        # Half the braking, as decisions are late; what remains at the goal is stopped within it.
-        braking = self.robot.wheel_limits.acceleration / self.pace**2
-        if math.isinf(braking):
-            return math.inf
-        late = self.latency * self.pace
-        # v * late + v² / braking is the way until it stands.
-        return 0.5 * braking * (math.sqrt(late * late + 4.0 * max(away, _LAST) / braking) - late)
-
-    def _spot_speed(self) -> float:
-        """Fastest turn on the spot [rad/s]."""
-        robot = self.robot
-        wheels = min(robot.max_wheel_speed, -robot.min_wheel_speed)
-        return min(robot.max_angular_speed, 2.0 * wheels / robot.wheel_base)
-
-    def _turn(self, off: float, speed: float) -> Command:
-        """The command that turns a robot with a speed [m/s] by an angle at the goal [rad]."""
-        if abs(speed) > _STANDS:
-            return self._command(0.0, 0.0)
-        off, limits = math.remainder(off, math.tau), self.robot.wheel_limits
-        change = 2.0 * min(limits.acceleration, limits.turning) / self.robot.wheel_base
-        fastest = min(self._spot_speed(), 0.5 * abs(off) / (self.period + self.latency))
-        if math.isfinite(change):
-            fastest = min(fastest, math.sqrt(change * abs(off)))
-        return self._command(0.0, math.copysign(fastest, off))
 
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
@@ -560,35 +494,6 @@ class Pilot:
         now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
         left, right = changed(now, to, limits, limits.acceleration, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half
-
-    def _filter(self, clearance: float) -> SafetyFilter:
-        """The filter of the task that a policy learned, for the robot that drives."""
-        card, learned = self.card, self.card.robot
-        braking = self.robot.wheel_limits.acceleration / widening(self.robot, learned)
-        braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
-        turns = min(turning(learned), turning(self.robot) / self.pace**2)
-        body = replace(
-            learned,
-            radius=max(self.robot.radius, 0.5 * learned.wheel_base),
-            wheel_acceleration=None if math.isinf(braking) else braking,
-            turn_acceleration=None if math.isinf(turns) else turns,
-            reverse=learned.reverse and self.robot.reverse,
-        )
-        repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
-        rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
-        return SafetyFilter(
-            body,
-            angles=ray_angles(card.field_of_view, rays),
-            sectors=card.sectors,
-            max_range=card.max_range,
-            closeness_distance=card.closeness_distance,
-            memory=card.memory,  # type: ignore[arg-type]
-            history=card.history,
-            time_step=card.period / repeat,
-            action_repeat=repeat,
-            clearance=clearance,
-            braking=STRENGTH,
-        )
 
     def _sides(self, plan: Plan | None) -> tuple[float, float]:
         """Width and depth of the map [m]."""
