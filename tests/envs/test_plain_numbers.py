@@ -14,7 +14,7 @@ CART = {
 }
 KEPT = {
     "robot": lambda: RobotModel(name="cart", **CART),
-    "noise": lambda: RobotNoise(range_noise=HALF, dropout=HALF, slip=np.float32(0), latency=ONE),
+    "noise": lambda: RobotNoise(range_noise=HALF, dropout=HALF, slip=np.float32(0)),
     "box": lambda: Box(-ONE, -HALF, ONE, HALF),
     "cylinder": lambda: Cylinder(ONE, HALF, HALF),
     "walker": lambda: Walker(radius=HALF, speed=HALF),

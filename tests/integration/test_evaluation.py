@@ -132,10 +132,11 @@ def test_a_policy_drives_another_robot_and_its_results_stay_apart(run: Path) -> 
     evaluate.main(how)
     evaluate.main([*how, "--robot", str(cart)])
     alone, moved = (
-        read_table(run / f"evaluation-B-kinematic{robot}" / "episodes.csv")["path_length"]
+        read_table(run / f"evaluation-B-kinematic{robot}" / "episodes.csv")["time_s"]
         for robot in ("", "-cart")
     )
-    assert (moved < 0.8 * alone).all()
+    # Both collide, the slower one later.
+    assert (moved > 1.3 * alone).all()
     said = json.loads((run / "evaluation-B-kinematic-cart" / "settings.json").read_text())
     assert said["robot"]["max_wheel_speed"] == 0.3
 

@@ -17,7 +17,7 @@ HEAVY = ("torchrl", "wandb", "matplotlib", "pandas")
     ("script", "word", "hint"),
     [
         ("train.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
-        ("train.py", "environment.noise.latncy=1", "did you mean 'environment.noise.latency'?"),
+        ("train.py", "environment.noise.dropot=1", "did you mean 'environment.noise.dropout'?"),
         ("train.py", "curriculum.stages=[{world:A,action:500}]", "did you mean 'actions'?"),
         ("train.py", "curriculum.stages=[{wrld:A,actions:5}]", "did you mean 'world'?"),
         ("train.py", "seed=abc", "seed: Value 'abc'"),
