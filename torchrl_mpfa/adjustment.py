@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, check
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.storages.table import SignalTable
+    from torchrl_mpfa.samplers.table import SignalTable
 
 Level = float | Literal["mean"]
 """A reward, or ``"mean"``: the mean reward of the buffer."""

@@ -42,7 +42,7 @@ from torchrl_mpfa.adjustment import Level, check_level
 from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check, check_finite
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.storages.table import SignalTable
+    from torchrl_mpfa.samplers.table import SignalTable
 
 
 def binary_entropy(first: Tensor, second: Tensor) -> Tensor:

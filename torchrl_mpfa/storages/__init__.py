@@ -1,7 +1,5 @@
-"""TorchRL's storages, with the signals of every slot in addition to the data."""
+"""TorchRL's storages, faster, and with room for the signals of a sampler beside the data."""
 
-from torchrl_mpfa.storages.storage import SignalStorageMixin
-from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage
 
-__all__ = ["SignalMemmapStorage", "SignalStorageMixin", "SignalTable", "SignalTensorStorage"]
+__all__ = ["SignalMemmapStorage", "SignalTensorStorage"]
