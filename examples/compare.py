@@ -89,7 +89,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.arms = parse_arms(options.arm)
         check_physics(options.physics or "kinematic")
         files.check_folder(options.folder)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         parser.error(str(error))
     for group in ("method", "learner", "seed"):
         names = getattr(options, f"{group}s")
@@ -146,4 +146,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

@@ -210,12 +210,12 @@ def output_folder(options: argparse.Namespace) -> Path:
     )
     policy = options.path
     if policy is None:
-        return Path("runs") / f"evaluation-{name_of(options)}" / name
+        return Path("runs") / files.short_name(f"evaluation-{name_of(options)}") / name
     if policy.is_dir():
         return policy / name
     if policy.name == files.POLICY:
         return policy.parent / name
-    return Path("runs") / f"evaluation-{policy.stem}" / name
+    return Path("runs") / files.short_name(f"evaluation-{policy.stem}") / name
 
 
 def printed(summary: pd.DataFrame) -> str:
@@ -364,4 +364,4 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    main()
+    files.run_script(main)

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy
+from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy, world_tasks
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
@@ -58,6 +58,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.robot = options.robot and resolve_robot(options.robot)
         options.policy = on_robot(load_policy(options.path), options.robot)
+        world_tasks(options.world, episodes=1)
     except (ValueError, OSError) as error:
         parser.error(str(error))
     options.source = policy_file(options.path)
@@ -68,6 +69,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--output must end in .onnx, got {options.output}")
     try:
         files.check_folder(options.output.parent)
+        files.check_name(_trial(options.output))
     except ValueError as error:
         parser.error(f"--output: {error}")
     if options.output.is_dir():
@@ -75,6 +77,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if not options.policy.layers:
         parser.error(f"{options.path} is an ONNX file: export the policy.npz that it came from")
     return options
+
+
+def _trial(output: Path) -> Path:
+    """Path of a file until it is known to do as the policy does."""
+    return output.with_name(f".{os.getpid()}.{output.name}")
 
 
 def known_results(source: Path, robot: RobotModel | None) -> list[dict[str, Any]]:
@@ -124,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     policy: Policy = options.policy
     results = known_results(options.source, options.robot)
     # Next to its place at first: a file that differs from its policy must not lie there.
-    trial = options.output.with_name(f".{os.getpid()}.{options.output.name}")
+    trial = _trial(options.output)
     try:
         export_policy(policy, trial, quantize=options.quantize)
         exported = load_policy(trial)
@@ -163,4 +170,4 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    files.run_script(main)

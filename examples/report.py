@@ -19,13 +19,13 @@ evaluation of each run, of which a higher score is better. Of these it writes ``
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import training.extra  # noqa: F401
 
 # isort: split
+from training import files
 from training.comparison.report import write_report
 from training.comparison.scores import CURVES, are_scores, write_scores
 
@@ -47,6 +47,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--output", type=Path, help="folder (default: that of the first path)")
     options = parser.parse_args(arguments)
+    try:
+        for path in options.paths:
+            files.check_name(path)
+    except ValueError as error:
+        parser.error(str(error))
     there = [path.resolve() for path in options.paths]
     for given, path in zip(options.paths, there, strict=True):
         if there.count(path) > 1:
@@ -70,4 +75,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

@@ -12,8 +12,9 @@
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    resume a run that was stopped
 
 ``training/settings/`` has every setting; ``--help`` prints them with their values. Ctrl-C,
-SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, with the last
-iteration saved; 2 if a setting is wrong; 128 plus the number of the signal that stopped it.
+SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2 let the iteration end and save. Exit status: 0; 1 after an
+error, with the last iteration saved; 2 if a setting is wrong; 128 plus the number of the signal
+that stopped it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pathlib import Path
 import training.extra  # noqa: F401
 
 # isort: split
+from training import files
 from training.finished import after_the_end, is_finished
 
 
@@ -50,4 +52,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    files.run_script(main)

@@ -90,7 +90,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         register()
         files.check_folder(options.folder)
         options.searched = read_ranges(options.ranges, options.settings)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         parser.error(str(error))
     return options
 
@@ -123,4 +123,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

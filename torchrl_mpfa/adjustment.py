@@ -8,16 +8,15 @@ https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, get_args, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, check
+from torchrl_mpfa.checks import BELOW_ONE, LEVEL, POSITIVE, Rule, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -28,17 +27,10 @@ _ENOUGH = 1000
 """With fewer rewards there is no warning that all are on one side."""
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
+_BOUND: Rule = (lambda word: word in get_args(Bound), "'floor', 'cap' or 'none'")
+_POSITION: Rule = (lambda word: word in get_args(Position), "'batch', 'rank' or 'count'")
 _ROUNDING = 64
 """Units in the last place by which a priority has to exceed the mean of its batch."""
-
-
-def check_level(positive_above: Level) -> None:
-    """Reject a level that is neither a finite number nor ``"mean"``."""
-    number = isinstance(positive_above, int | float) and not isinstance(positive_above, bool)
-    if positive_above != "mean" and not (number and math.isfinite(positive_above)):
-        raise ValueError(
-            f"positive_above must be a finite number or 'mean', got {positive_above!r}"
-        )
 
 
 def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
@@ -229,13 +221,9 @@ class PositiveBoost:
     takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, boost=self.boost)
-        check_level(self.positive_above)
-        check(BELOW_ONE, target_share=self.target_share)
+        keep(self, boost=POSITIVE, positive_above=LEVEL, target_share=BELOW_ONE, bound=_BOUND)
         if self.target_share > 0 and self.boost < 1:
             raise ValueError(f"boost must be at least 1 with a target_share, got {self.boost}")
-        if self.bound not in ("floor", "cap", "none"):
-            raise ValueError(f"bound must be 'floor', 'cap' or 'none', got {self.bound!r}")
 
     @property
     def counts(self) -> bool:
@@ -288,10 +276,7 @@ class PositiveDecay:
     takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, sharpness=self.sharpness)
-        check_level(self.positive_above)
-        if self.position not in ("batch", "rank", "count"):
-            raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")
+        keep(self, sharpness=POSITIVE, positive_above=LEVEL, position=_POSITION)
 
     def factors(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Return the factor of Eq. (23) for each transition, shape ``[B]``."""

@@ -20,7 +20,7 @@ from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_gener
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
-from torchrl_mpfa.storages.schema import as_path, check_finite_entries
+from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
 from torchrl_mpfa.transforms import KEPT
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
@@ -93,7 +93,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self.stale_updates = 0
         self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
-            check_counts(batch_size=batch_size)
+            kwargs["batch_size"] = check_counts(batch_size=batch_size)
         if (prefetch := kwargs.get("prefetch")) not in (None, 0):
             raise ValueError(
                 f"prefetch must be None, got {prefetch!r}: a batch that is sampled ahead knows "
@@ -175,7 +175,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 updated.
         """
         if batch_size is not None:
-            check_counts(batch_size=batch_size)
+            batch_size = check_counts(batch_size=batch_size)
         if isinstance(self.sampler, PrioritizedSampler):
             self._count_batch()
         if return_info or include_info is not None or not self._fuses:
@@ -222,7 +222,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
         if self._storage.ndim == 1:
-            index = index.reshape(-1)
+            index = as_integers(index).reshape(-1)
         signals: dict[str, Tensor] = {}
         for signal in self._sampler.signals:
             if signal.known_at == "update":

@@ -29,6 +29,10 @@ COUNT_OR_ZERO: Rule = (
     lambda value: not isinstance(value, bool) and COUNT[0](value + 1),
     "an integer from 0 to 2147483646",
 )
+LEVEL: Rule = (
+    lambda x: x == "mean" or (not isinstance(x, bool | str | None) and math.isfinite(x)),
+    "a finite number or 'mean'",
+)
 
 
 def seeded_generator(
@@ -50,14 +54,18 @@ def generator_on(device: torch.device, source: torch.Generator | None) -> torch.
     return source if own else seeded_generator(source, device)
 
 
-def check(rule: Rule, **values: Any) -> None:
-    """Reject, by name, values that a rule does not allow.
+def check(rule: Rule, **values: Any) -> Any:
+    """Return a value, or a tuple of several, as plain numbers; reject those against a rule by name.
+
+    A saved state may hold Python's own numbers, not NumPy's.
 
     Raises:
         TypeError: If a value cannot be compared with a number.
         ValueError: If it is not allowed.
 
     Examples:
+        >>> check(POSITIVE, lr=torch.tensor(0.5), tau=1)
+        (0.5, 1)
         >>> check(POSITIVE, lr=0.1, tau=0.0)
         Traceback (most recent call last):
         ...
@@ -72,6 +80,14 @@ def check(rule: Rule, **values: Any) -> None:
             raise TypeError(f"{name} must be a number, got {value!r}") from None
         if not inside:
             raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    plain = tuple(v.item() if hasattr(v, "item") else v for v in values.values())
+    return plain if len(plain) > 1 else plain[0]
+
+
+def keep(record: Any, **rules: Rule) -> None:
+    """Put plain values in the fields of a dataclass, also of a frozen one, as :func:`check`."""
+    for name, rule in rules.items():
+        object.__setattr__(record, name, check(rule, **{name: getattr(record, name)}))
 
 
 def unknown(word: str, name: object, known: Iterable[str]) -> str:
@@ -101,9 +117,9 @@ def rules_of(kind: type) -> dict[str, Rule]:
     return found
 
 
-def check_counts(**counts: Any) -> None:
-    """Reject, by name, anything but an integer from 1 to 2147483647."""
-    check(COUNT, **counts)
+def check_counts(**counts: Any) -> Any:
+    """Return integers from 1 to 2147483647 as :func:`check` does; reject anything else by name."""
+    return check(COUNT, **counts)
 
 
 def bounds(values: Tensor) -> tuple[float, float]:

@@ -38,8 +38,8 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Level, check_level
-from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check, check_finite
+from torchrl_mpfa.adjustment import Level
+from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, Rule, check, check_finite, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -250,10 +250,8 @@ class EntropyFusion:
         names = self.reward_signals
         if isinstance(names, str) or not isinstance(names, Sequence | None):
             raise TypeError(f"reward_signals must be names, got {self.reward_signals!r}")
-        check_level(self.positive_above)
-        if self.population not in ("buffer", "batch"):
-            raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
-        check(BELOW_ONE, floor=self.floor)
+        population: Rule = (lambda word: word in ("buffer", "batch"), "'buffer' or 'batch'")
+        keep(self, positive_above=LEVEL, floor=BELOW_ONE, population=population)
         if self.positive_above == "mean":
             warnings.warn(
                 "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
@@ -310,8 +308,8 @@ class FixedFusion:
     def __post_init__(self) -> None:
         if not isinstance(self.values, Mapping):
             raise TypeError(f"values must be a weight for each signal, got {self.values!r}")
-        for name, value in self.values.items():
-            check(NOT_NEGATIVE, **{f"weight of {name!r}": value})
+        values = {n: check(NOT_NEGATIVE, **{f"weight of {n!r}": v}) for n, v in self.values.items()}
+        object.__setattr__(self, "values", values)
         if not any(self.values.values()):
             raise ValueError(f"values must have a positive weight, got {self.values}")
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.buffer import SignalReplayBuffer
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts
 
 _LOW, _HIGH = 1e-6, 1e6
 """Ends of the bins; what lies beyond counts to the outermost ones."""
@@ -44,20 +44,20 @@ class ReplayHistory:
     """
 
     def __init__(self, *, bins: int = 24) -> None:
-        check_counts(bins=bins)
-        count = round(np.log10(_HIGH / _LOW)) * bins
+        count = round(np.log10(_HIGH / _LOW)) * check_counts(bins=bins)
         self.edges: Any = np.geomspace(_LOW, _HIGH, count + 1)
         """Ends of the bins, ``[E + 1]``."""
         self._steps: dict[str, list[int]] = {}
         self._counts: dict[str, list[Any]] = {}
 
     def add(self, step: int, buffer: SignalReplayBuffer) -> None:
-        """Add histograms of a buffer as it is.
+        """Add histograms of a buffer as it is, or raise ``ValueError`` for a step that is no count.
 
         Args:
             step: The time, such as the number of actions so far.
             buffer: The buffer.
         """
+        step = check(COUNT_OR_ZERO, step=step)
         for name, values in buffer.distributions().items():
             self._count(name, step, values)
 

@@ -55,7 +55,11 @@ def save_atomically(state: Any, path: str | Path) -> None:
         {'step': 3}
     """
     with _replacing(Path(path)) as file:
-        torch.save(state, file)
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:
+            # PyTorch hides what the disk said behind a count of its own.
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
         _seal(file)
 
 
@@ -281,8 +285,10 @@ def _replacing(path: Path) -> Iterator[IO[bytes]]:
             # Without this, a power cut after the rename could leave an empty file.
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
 
 

@@ -41,7 +41,7 @@ class TransformMemory:
         # By module, the values of its attributes before the first write that changed them.
         self._first: dict[nn.Module, _Attributes] = {}
 
-    def _parts(self) -> dict[str, nn.Module]:
+    def parts(self) -> dict[str, nn.Module]:
         """Return the transforms that run at a write, and the modules in them, by name."""
         return {
             f"{place}.{name}": module
@@ -56,7 +56,7 @@ class TransformMemory:
 
         Attributes and random numbers are set back if anything raises inside of this.
         """
-        parts = [*self._parts().values()]
+        parts = [*self.parts().values()]
         if not parts:
             yield self._transform.inv(data)
             return
@@ -106,14 +106,14 @@ class TransformMemory:
 
     def empty(self) -> None:
         """Give attributes the values that they had before any write."""
-        for part in self._parts().values():
+        for part in self.parts().values():
             _replace(part, _attributes(part) | _copied(self._first.get(part, {})))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the attributes that writes changed, as tensors and plain values."""
         return {
             name: {key: _packed(_attributes(part)[key]) for key in self._first[part]}
-            for name, part in self._parts().items()
+            for name, part in self.parts().items()
             if part in self._first
         }
 
@@ -123,7 +123,7 @@ class TransformMemory:
         Raises:
             ValueError: If the state is of other transforms, or a saved transition is not finite.
         """
-        parts = self._parts()
+        parts = self.parts()
         self.empty()
         for name, saved in state.items() if isinstance(state, Mapping) else [("", state)]:
             own = _attributes(parts[name]) if name in parts else {}

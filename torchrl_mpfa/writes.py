@@ -50,7 +50,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         Args:
             tensordicts: Transitions, batch size ``[B]``, or ``[B, T]`` from ``B`` environments. In
                 a storage of one dimension each of the latter is a row of its own, environment by
-                environment.
+                environment; padding of split trajectories is left out.
             update_priority: As in TorchRL.
 
         Returns:
@@ -59,8 +59,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         Raises:
             KeyError: If an entry is missing or unknown; nothing is changed.
             ValueError: If an entry has another shape or dtype than in the storage, a number is not
-                finite, a first priority cannot be, or there is no batch size; nothing is changed,
-                in the transforms neither.
+                finite, a first priority cannot be, there is no batch size, or padding cannot be
+                left out; nothing is changed, in the transforms neither.
         """
         if not self._checks(tensordicts):
             return super().extend(tensordicts, update_priority=update_priority)
@@ -69,10 +69,26 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 f"tensordicts must have a batch size of {self._storage.ndim} or more dimensions, "
                 f"got {[*tensordicts.shape]}: write a single step by add(...)"
             )
+        tensordicts = self._without_padding(tensordicts)
         # What is made here must be of use where the caller has no inference mode.
         outside = torch.inference_mode(False), torch.no_grad()
         with outside[0], outside[1], self._memory.transformed(tensordicts) as data:
             return self._extend_checked(data, update_priority is not False)
+
+    def _without_padding(self, data: TensorDictBase) -> TensorDictBase:
+        """Leave out rows that a mask of padded trajectories marks, as ``split_trajs`` makes it."""
+        for key in (("collector", "mask"), "mask"):
+            mask = data.get(key, None)
+            # A mask of one's own, as of actions, has a dimension more.
+            pads = isinstance(mask, Tensor) and mask.dtype is torch.bool
+            if pads and mask.shape == data.shape and not mask.all():
+                if self._storage.ndim > 1 or self._memory.parts():
+                    raise ValueError(
+                        f"padding, which {key!r} marks, cannot be left out with several dimensions "
+                        f"or a transform at the write: extend(rows[rows[{key!r}]]) for each row"
+                    )
+                data = data[mask]
+        return data
 
     def _extend_checked(self, data: TensorDictBase | None, prioritizes: bool) -> Tensor:
         """Write transitions that the transforms made."""

@@ -26,6 +26,17 @@ def check_number(name: str, value: Any) -> float:
     return number
 
 
+def plain(value: Any) -> Any:
+    """A number of Python's own in the place of one of NumPy's, which no saved state may hold."""
+    return value.item() if hasattr(value, "item") else value
+
+
+def keep(record: Any, *names: str) -> None:
+    """Put plain numbers in the fields of a dataclass, also of a frozen one."""
+    for name in names:
+        object.__setattr__(record, name, plain(getattr(record, name)))
+
+
 def all_finite(values: Iterable[Any]) -> bool:
     """Return True if all are finite numbers, which text and truth values are not."""
     try:

@@ -44,6 +44,8 @@ def write_atomically(content: bytes, path: Path) -> None:
             # Temporary files are readable by their owner alone; this one by all.
             os.chmod(new.name, 0o644)
             os.replace(new.name, path)
-        except BaseException:
+        except BaseException as error:
             os.unlink(new.name)
+            if isinstance(error, OSError):
+                error.filename = str(path)
             raise

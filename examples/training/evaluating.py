@@ -25,6 +25,7 @@ from mpfa_envs.planners import DynamicWindow, MapPlanner
 from mpfa_envs.robots.drives import SERVERS
 from mpfa_envs.robots.model import ROBOTS, RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from training.files import short_name
 from training.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow | Filtered
@@ -61,7 +62,7 @@ def evaluation_folder(
         'evaluation-test+bars-test-wheels-slip0.1'
     """
     errors = {} if noise is None else asdict(noise)
-    return "".join(
+    name = "".join(
         [
             f"evaluation-{worlds_label(words)}-{physics}",
             "-filter" if filtered else "",
@@ -70,6 +71,7 @@ def evaluation_folder(
             *(f"-{what}{value:g}" for what, value in errors.items() if value),
         ]
     )
+    return short_name(name)
 
 
 def add_robot(parser: ArgumentParser, whose: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from training import files
 
 def is_finished(folder: Path) -> bool:
     """Return True if a run is finished and its policy and episodes are there."""
-    there = all((folder / name).exists() for name in (files.POLICY, files.EPISODES))
+    # A name may be too long to be asked for.
+    there = all(os.path.exists(folder / name) for name in (files.POLICY, files.EPISODES))
     return there and bool(read_json(folder / files.STATUS).get("finished"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from argparse import ArgumentParser, ArgumentTypeError
@@ -63,7 +64,7 @@ def load_plugin(path: str | Path) -> str:
         ValueError: If there is no such file, an error ended it, or what it registered cannot be.
     """
     file = Path(path).resolve()
-    if not file.is_file() or file.suffix != ".py":
+    if not os.path.isfile(file) or file.suffix != ".py":
         raise ValueError(f"plugin must be a Python file, got {path}")
     # By its name, as processes of Ray look for what it defines.
     there, known = sys.modules.get(file.stem), digest(file)

@@ -1,8 +1,11 @@
 """Constructors of losses, learners, networks and methods: bad arguments are named with values."""
 
 import math
-from copy import deepcopy
+import pickle
+from copy import copy, deepcopy
 from functools import partial
+from io import BytesIO
+from itertools import product
 
 import pytest
 import torch
@@ -267,14 +270,21 @@ def test_estimator_that_makes_no_targets_for_a_critic_of_actions_is_rejected(kin
     assert loss.value_type is ValueEstimators.TD0
 
 
+COPY = "cannot be copied or pickled: make another one, and have it load"
+HOW = [copy, deepcopy, pickle.dumps, partial(torch.save, f=BytesIO())]
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda: ActorCriticLearner(discrete_loss()), "loss must be a SignalLoss, got SignalDQN"),
         (lambda: DQNLearner(make_of("ddpg")), "loss must be a SignalDQNLoss, got SignalDDPGLoss"),
         (lambda: TabularQLearner(make_value_network(4, 5)), "policy must be one of make_value_tab"),
-        *[(partial(deepcopy, make_learner(k)), "cannot be copied: make another") for k in KINDS],
-        (partial(deepcopy, make_discrete()), "a DQNLearner cannot be copied: make another"),
+        *[
+            (partial(how, make_learner(k)), f"a ActorCriticLearner {COPY}")
+            for how, k in product(HOW, KINDS)
+        ],
+        (partial(deepcopy, make_discrete()), f"a DQNLearner {COPY}"),
     ],
 )
 def test_learner_of_another_loss_or_a_copy_is_rejected(make, words):
@@ -293,3 +303,21 @@ def test_rates_by_default_are_those_of_table_1_and_a_light_decay(kind):
     assert [group["lr"] for group in groups[:2]] == [1e-4, 1e-4]
     assert [group["weight_decay"] for group in groups[:2]] == [0.0, 1e-4]
     assert ActorCriticLearner(make_of(kind)).policy_delay == (2 if kind == "td3" else 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_learner_of_a_copied_loss_is_rejected_and_one_of_its_state_learns(kind):
+    loss = make_of(kind)
+    with pytest.raises(ValueError, match="loss must be no copy: make another"):
+        ActorCriticLearner(deepcopy(loss))
+    other = make_of(kind, networks=make_networks(1, stochastic=kind == "sac"))
+    other.load_state_dict(loss.state_dict())
+    policy = ActorCriticLearner(other).policy
+    expected = loss.actor_network.state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in policy.state_dict().items())
+
+
+def test_policy_of_a_learner_of_a_copied_loss_of_values_is_the_one_that_learns():
+    learner = DQNLearner(deepcopy(discrete_loss()))
+    trained = learner.loss.value_network_params.values(True, True)
+    assert all(a is b for a, b in zip(learner.policy.parameters(), trained, strict=True))

@@ -263,7 +263,7 @@ def test_rewards_that_are_not_one_finite_number_are_rejected_before_the_write(ro
 def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
     bad = Signal("bad", key=("next", "reward"), known_at="write", priority=torch.neg)
     buffer = make_buffer(4, signals=["td_error", bad])
-    with rejected(buffer, ValueError, r"signal 'bad' must not be negative, got -1.0"):
+    with rejected(buffer, ValueError, r"signal 'bad' must be finite and not negative, got -1.0"):
         buffer.extend(make_transitions(1, rewards=[1.0]))
 
 

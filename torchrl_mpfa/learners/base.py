@@ -7,7 +7,7 @@ learner has the same methods and takes its place.
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal, NoReturn, Protocol, runtime_checkable
+from typing import Any, Literal, NoReturn, Protocol, SupportsIndex, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -113,7 +113,7 @@ class OptimizedLearner:
     def __init__(
         self, loss: Any, groups: list[dict[str, Any]], optimizer: OptimizerName, tau: float
     ) -> None:
-        check(ABOVE_ZERO, tau=tau)
+        tau = check(ABOVE_ZERO, tau=tau)
         self.loss: Any = loss
         self.optimizer = make_optimizer(optimizer, groups)
         self._rates = [group["lr"] for group in groups]
@@ -184,16 +184,16 @@ class OptimizedLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        check(SHARE, factor=factor)
+        factor = check(SHARE, factor=factor)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * factor
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        # TorchRL's losses hold parameters in ways that a deep copy takes apart: the optimizer of a
-        # copy would move none of them.
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        # TorchRL's losses hold parameters in ways that a copy takes apart: the optimizer of a copy
+        # would move none of them. Copies and pickles are made by this.
         raise TypeError(
-            f"a {type(self).__name__} cannot be copied: make another one, and have it load the "
-            "state_dict() of this one"
+            f"a {type(self).__name__} cannot be copied or pickled: make another one, and have it "
+            "load the state_dict() of this one"
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -255,7 +255,7 @@ class ActorCriticLearner(OptimizedLearner):
     Raises:
         TypeError: If the loss writes no signals.
         ValueError: If a rate is not positive, the decay negative, ``tau`` not in (0, 1], the delay
-            no count, or the optimizer unknown.
+            no count, the optimizer unknown, or the loss a copy.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
@@ -279,13 +279,18 @@ class ActorCriticLearner(OptimizedLearner):
     ) -> None:
         if not isinstance(loss, SignalLoss):
             raise TypeError(f"loss must be a SignalLoss, got {type(loss).__name__}")
+        trained = {*map(id, loss.actor_parameters())}
+        if not all(id(each) in trained for each in loss.actor_network.parameters()):
+            # The policy of the copy would keep its first weights.
+            raise ValueError("loss must be no copy: make another, and load a state_dict() in it")
         if loss.reduction == "none":
             raise ValueError("reduction of the loss must be 'mean' or 'sum', got 'none'")
-        self.policy_delay = loss.policy_delay if policy_delay is None else policy_delay
-        check_counts(policy_delay=self.policy_delay)
-        check(POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr, alpha_lr=alpha_lr)
-        check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)
-        decay = {"weight_decay": critic_weight_decay}
+        delay = loss.policy_delay if policy_delay is None else policy_delay
+        self.policy_delay: int = check_counts(policy_delay=delay)
+        actor_lr, critic_lr, alpha_lr = check(
+            POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr, alpha_lr=alpha_lr
+        )
+        decay = {"weight_decay": check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)}
         groups = [
             {"params": loss.actor_parameters(), "lr": actor_lr},
             {"params": loss.critic_parameters(), "lr": critic_lr, **decay},

@@ -65,8 +65,8 @@ class DQNLearner(OptimizedLearner):
     ) -> None:
         if not isinstance(loss, SignalDQNLoss):
             raise TypeError(f"loss must be a SignalDQNLoss, got {type(loss).__name__}")
-        check(POSITIVE, lr=lr)
-        check(NOT_NEGATIVE, weight_decay=weight_decay)
+        lr = check(POSITIVE, lr=lr)
+        weight_decay = check(NOT_NEGATIVE, weight_decay=weight_decay)
         network = loss.value_network
         if not isinstance(network, DirectModule):
             raise TypeError(f"network must be a DirectModule, got {type(network).__name__}")
@@ -148,10 +148,9 @@ class TabularQLearner:
     ) -> None:
         if not isinstance(getattr(policy, "module", None), ValueTable):
             raise TypeError(f"policy must be one of make_value_table, got {type(policy).__name__}")
-        check(ABOVE_ZERO, lr=lr)
-        check(SHARE, gamma=gamma)
-        self.policy, self.gamma, self.importance = policy, gamma, importance
-        self._rate = self._first_rate = lr
+        self._rate = self._first_rate = check(ABOVE_ZERO, lr=lr)
+        self.gamma = check(SHARE, gamma=gamma)
+        self.policy, self.importance = policy, importance
         self.updates = 0
         """Training steps taken."""
 
@@ -215,8 +214,7 @@ class TabularQLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        check(SHARE, factor=factor)
-        self._rate = self._first_rate * factor
+        self._rate = self._first_rate * check(SHARE, factor=factor)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the table and the count."""

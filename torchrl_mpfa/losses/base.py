@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -14,7 +15,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, Rule, check, check_counts
 from torchrl_mpfa.losses.functional import (
     DISTANCES,
     LEAST_NOISE,
@@ -69,10 +70,8 @@ class SignalKeys:
     information_gain_signal: NestedKey = INFORMATION_GAIN.key
 
 
-def check_importance(importance: str) -> None:
-    """Reject an unknown use of importance weights."""
-    if importance not in ("critic", "torchrl", "none"):
-        raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
+_USES = ("critic", "torchrl", "none")
+IMPORTANCE: Rule = (lambda use: use in _USES, "'critic', 'torchrl' or 'none'")
 
 
 class SignalLoss(HoldsNetworks):
@@ -148,16 +147,17 @@ class SignalLoss(HoldsNetworks):
         unknown = [name for name in signals if name not in KNOWN_SIGNALS]
         if unknown:
             raise ValueError(f"signals must be among {KNOWN_SIGNALS}, got {unknown}")
-        check_importance(importance)
+        check(IMPORTANCE, importance=importance)
         if kwargs.get("loss_function", "l2") not in DISTANCES:
             raise ValueError(
                 f"loss_function must be one of {DISTANCES}, got {kwargs['loss_function']!r}"
             )
-        check((lambda order: order > 0, "positive"), gradient_order=gradient_order)
-        check(POSITIVE, reward_scale=reward_scale)
-        check(NOT_NEGATIVE, saturation_penalty=saturation_penalty)
-        check(NOT_NEGATIVE, saturation_limit=saturation_limit, pal_alpha=pal_alpha)
-        check_counts(target_average=target_average)
+        gradient_order = check((lambda n: n > 0, "positive"), gradient_order=gradient_order)
+        reward_scale = check(POSITIVE, reward_scale=reward_scale)
+        saturation_penalty = check(NOT_NEGATIVE, saturation_penalty=saturation_penalty)
+        saturation_limit = check(NOT_NEGATIVE, saturation_limit=saturation_limit)
+        pal_alpha = check(NOT_NEGATIVE, pal_alpha=pal_alpha)
+        target_average = check_counts(target_average=target_average)
         if target_average > 1 and not isinstance(critic_network, DirectModule):
             raise ValueError(
                 f"target_average = {target_average} needs a DirectModule as critic, "
@@ -172,7 +172,8 @@ class SignalLoss(HoldsNetworks):
             actor_network,
             critic_network,
             use_prioritized_weights="auto" if importance == "torchrl" else False,
-            **kwargs,
+            # TorchRL makes tensors of some, whose type would be that of a number of NumPy.
+            **{k: v.item() if isinstance(v, np.generic) else v for k, v in kwargs.items()},
         )  # type: ignore[call-arg]
         self.signals = tuple(signals)
         self.gradient_order = gradient_order

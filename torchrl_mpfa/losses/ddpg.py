@@ -84,7 +84,8 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         bounds: Any = None,
         **kwargs: Any,
     ) -> None:
-        check(NOT_NEGATIVE, policy_noise=policy_noise, noise_clip=noise_clip)
+        policy_noise = check(NOT_NEGATIVE, policy_noise=policy_noise)
+        noise_clip = check(NOT_NEGATIVE, noise_clip=noise_clip)
         within = given_bounds(action_spec, bounds) if policy_noise > 0 else None
         super().__init__(actor_network, value_network, delay_actor=delay_actor, **kwargs)
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
@@ -182,7 +183,7 @@ def make_ddpg_loss(
         >>> make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)).importance
         'critic'
     """
-    check(SHARE, gamma=gamma)
+    gamma = check(SHARE, gamma=gamma)
     loss = SignalDDPGLoss(actor, critic, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.base import check_importance
+from torchrl_mpfa.losses.base import IMPORTANCE
 from torchrl_mpfa.losses.functional import distance, estimated_target, read_choices
 from torchrl_mpfa.losses.stacked import Function, HoldsNetworks, as_function, bind
 from torchrl_mpfa.priorities import td_error_priority
@@ -66,11 +66,11 @@ class SignalDQNLoss(HoldsNetworks, DQNLoss):
         gamma: float = 0.99,
     ) -> None:
         _check_signals(signals)
-        check_importance(importance)
+        check(IMPORTANCE, importance=importance)
         if loss_function not in _DISTANCES:
             raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
-        check(POSITIVE, reward_scale=reward_scale)
-        check(SHARE, gamma=gamma)
+        reward_scale = check(POSITIVE, reward_scale=reward_scale)
+        gamma = check(SHARE, gamma=gamma)
         super().__init__(
             value_network,
             loss_function=loss_function,

@@ -187,7 +187,7 @@ def make_sac_loss(
         >>> float(make_sac_loss(actor, critic, target_entropy=-1.0).target_entropy)
         -1.0
     """
-    check(SHARE, gamma=gamma)
+    gamma = check(SHARE, gamma=gamma)
     loss = SignalSACLoss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

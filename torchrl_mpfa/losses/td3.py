@@ -149,7 +149,7 @@ def make_td3_loss(
         >>> loss.max_action.item()
         2.0
     """
-    check(SHARE, gamma=gamma)
+    gamma = check(SHARE, gamma=gamma)
     loss = SignalTD3Loss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, SHARE, Rule, check, rules_of
+from torchrl_mpfa.checks import COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, SHARE, Rule, keep, rules_of
 
 if TYPE_CHECKING:
     from torchrl.data import RandomSampler
@@ -78,8 +78,7 @@ class Method:
     """True if the method is only for learners with an actor."""
 
     def __post_init__(self) -> None:
-        for name, rule in rules_of(type(self)).items():
-            check(rule, **{name: getattr(self, name)})
+        keep(self, **rules_of(type(self)))
 
     @property
     def rows(self) -> int:

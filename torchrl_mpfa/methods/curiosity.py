@@ -100,9 +100,9 @@ class Curiosity(nn.Module):
         super().__init__()
         check_counts(observation_size=observation_size, action_size=action_size)
         check_counts(features=features, width=width)
-        check(POSITIVE, scale=scale, lr=lr)
-        check(SHARE, forward_share=forward_share)
-        self.scale, self.forward_share, self.reward_key = scale, forward_share, reward_key
+        self.scale, lr = check(POSITIVE, scale=scale, lr=lr)
+        self.forward_share = check(SHARE, forward_share=forward_share)
+        self.reward_key = reward_key
         self.encoder = _network(observation_size, width, features)
         self.inverse_model = _network(2 * features, width, action_size)
         self.forward_model = _network(features + action_size, width, features)

@@ -83,9 +83,8 @@ class GeometricSampler(NewestSampler):
     """
 
     def __init__(self, *, recency: float = 3.0) -> None:
-        check(NOT_NEGATIVE, recency=recency)
         super().__init__()
-        self.recency = recency
+        self.recency: float = check(NOT_NEGATIVE, recency=recency)
 
     @property
     def divisible(self) -> bool:

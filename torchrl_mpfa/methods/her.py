@@ -116,8 +116,7 @@ class HindsightGoals(Transform):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        check_counts(goals=goals)
-        self.goals, self.generator = goals, generator
+        self.goals, self.generator = check_counts(goals=goals), generator
         self._relabel, self._episode_key = relabel, episode_key
         # Never written in place, and for that reason a tuple.
         self._pending: tuple[TensorDictBase, ...] = ()

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
-from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check, keep
 from torchrl_mpfa.fusion import FixedFusion
 from torchrl_mpfa.signals import Signal
 
@@ -94,6 +94,7 @@ class ScheduledFusion:
 
     def __post_init__(self) -> None:
         self._ends = FixedFusion(self.start), FixedFusion(self.end)
+        self.start, self.end = (each.values for each in self._ends)
         self._fraction = 0.0
 
     @property
@@ -107,8 +108,7 @@ class ScheduledFusion:
         Raises:
             ValueError: If ``fraction`` is outside.
         """
-        check(SHARE, fraction=fraction)
-        self._fraction = fraction
+        self._fraction = check(SHARE, fraction=fraction)
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return the present weights in the order of ``names``, shape ``[K]``."""
@@ -132,7 +132,7 @@ def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
         >>> value_schedule().end
         {'relative_value': 0.5, 'relative_td_error': 0.5}
     """
-    check(SHARE, final_share=final_share)
+    final_share = check(SHARE, final_share=final_share)
     value, error = RELATIVE_VALUE.name, RELATIVE_ERROR.name
     return ScheduledFusion({value: 0.0, error: 1.0}, {value: final_share, error: 1.0 - final_share})
 
@@ -160,8 +160,7 @@ class HVPERPenalty:
     floor: float = 0.01
 
     def __post_init__(self) -> None:
-        check(NOT_NEGATIVE, penalty=self.penalty)
-        check(POSITIVE, floor=self.floor)
+        keep(self, penalty=NOT_NEGATIVE, floor=POSITIVE)
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Lower priorities by the replays of their transitions, shape ``[B]``."""

@@ -123,12 +123,9 @@ class KLPERSelection:
         sigma: float | Callable[[], float],
         action_key: NestedKey = "action",
     ) -> None:
-        check_counts(batches=batches)
-        if not callable(sigma):
-            check(NOT_NEGATIVE, sigma=sigma)
         self.policy = policy
-        self.batches = batches
-        self.sigma = sigma
+        self.batches: int = check_counts(batches=batches)
+        self.sigma = sigma if callable(sigma) else check(NOT_NEGATIVE, sigma=sigma)
         self.action_key = action_key
 
     def select(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_mpfa.checks import check
+from torchrl_mpfa.checks import Rule, check
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.trees import empty_tree_like, leaves_of, set_leaves
 from torchrl_mpfa.selection import SampledBatch
@@ -49,8 +49,8 @@ class LA3PSampler(SignalSampler):
     KIND = "la3p"
 
     def __init__(self, *args: Any, uniform_fraction: float = 0.5, **kwargs: Any) -> None:
-        check((lambda share: 0.0 < share < 1.0, "in (0, 1)"), uniform_fraction=uniform_fraction)
-        self.uniform_fraction = uniform_fraction
+        inside: Rule = (lambda share: 0.0 < share < 1.0, "in (0, 1)")
+        self.uniform_fraction: float = check(inside, uniform_fraction=uniform_fraction)
         self._part: Part | None = None
         super().__init__(*args, **kwargs)
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
-from torchrl_mpfa.checks import POSITIVE, check
+from torchrl_mpfa.checks import POSITIVE, keep
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LAPFloor:
     takes_batches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check(POSITIVE, floor=self.floor)
+        keep(self, floor=POSITIVE)
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Raise priorities to the floor, shape ``[B]``."""

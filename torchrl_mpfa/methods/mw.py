@@ -45,8 +45,7 @@ class MWSampler(SignalSampler):
     SAVED = (*SignalSampler.SAVED, "_spent")
 
     def __init__(self, *args: Any, replay_cap: int = 1024, **kwargs: Any) -> None:
-        check_counts(replay_cap=replay_cap)
-        self.replay_cap = replay_cap
+        self.replay_cap: int = check_counts(replay_cap=replay_cap)
         super().__init__(*args, **kwargs)
 
     @property

@@ -66,8 +66,7 @@ class RankPERSampler(SignalSampler):
     SAVED = (*SignalSampler.SAVED, "_order", "_written")
 
     def __init__(self, *args: Any, rank_refresh: float = 0.25, **kwargs: Any) -> None:
-        check(NOT_NEGATIVE, rank_refresh=rank_refresh)
-        self.rank_refresh = rank_refresh
+        self.rank_refresh: float = check(NOT_NEGATIVE, rank_refresh=rank_refresh)
         super().__init__(*args, **kwargs)
 
     def _init(self) -> None:

@@ -110,8 +110,7 @@ class ReaPERSampler(SignalSampler):
     """The storage that is sampled from."""
 
     def __init__(self, *args: Any, exponent: float = 0.3, **kwargs: Any) -> None:
-        check(POSITIVE, exponent=exponent)
-        self.exponent = exponent
+        self.exponent: float = check(POSITIVE, exponent=exponent)
         super().__init__(*args, **kwargs)
         if TD_ERROR not in self.signals:
             raise ValueError(f"signals must have {TD_ERROR.name!r}, got {self._names}")

@@ -119,11 +119,9 @@ class ReFERSelection:
     def __init__(
         self, policy: TensorDictModule, *, far_share: float = 0.1, cutoff: float = 4.0
     ) -> None:
-        check(SHARE, far_share=far_share)
-        check(POSITIVE, cutoff=cutoff)
         self.policy = policy
-        self.far_share = far_share
-        self.cutoff = cutoff
+        self.far_share: float = check(SHARE, far_share=far_share)
+        self.cutoff: float = check(POSITIVE, cutoff=cutoff)
 
     def limit(self, batches: int) -> float:
         """Compute the ratio :math:`c` above which a transition is far after these batches."""

@@ -88,8 +88,7 @@ class ActionScale(nn.Module):
         self.clips = saturation_limit is not None
         reached = 1.0
         if saturation_limit is not None:
-            check(POSITIVE, saturation_limit=saturation_limit)
-            reached = math.tanh(saturation_limit)
+            reached = math.tanh(check(POSITIVE, saturation_limit=saturation_limit))
             self.register_buffer("low", low)
             self.register_buffer("high", high)
         self.register_buffer("center", (high + low) / 2)

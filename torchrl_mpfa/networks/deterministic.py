@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts
+from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, check_counts, keep
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
 
 
@@ -76,9 +76,9 @@ class Perceptron:
     final_init: float | None
 
     def __post_init__(self) -> None:
-        check_counts(width=self.width, layers=self.layers)
+        keep(self, width=COUNT, layers=COUNT)
         if self.final_init is not None:
-            check(NOT_NEGATIVE, final_init=self.final_init)
+            keep(self, final_init=NOT_NEGATIVE)
 
     def hidden(self, inputs: int, count: int) -> list[nn.Module]:
         """Make hidden layers, each followed by ReLU and, by option, LayerNorm before it."""

@@ -107,7 +107,6 @@ class SignalSampler(TreeSampler):
         reward_key: NestedKey = ("next", "reward"),
         **kwargs: Any,
     ) -> None:
-        check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
         if not isinstance(self.fusion, Fusion):
@@ -120,7 +119,7 @@ class SignalSampler(TreeSampler):
         for adjust in self.adjustments:
             if not callable(adjust):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
-        self.entropy_refresh = entropy_refresh
+        self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self._counting = [counts_buffer(each) for each in self.adjustments]
         self.reward_key = reward_key
         self._warned: set[str] = set()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_mpfa.adjustment import Level, PositiveBoost, PositiveDecay, check_level
+from torchrl_mpfa.adjustment import Level, PositiveBoost, PositiveDecay
+from torchrl_mpfa.checks import LEVEL, check
 from torchrl_mpfa.fusion import EntropyFusion
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS
@@ -58,7 +59,7 @@ class MPFASampler(SignalSampler):
         positive_above: Level = 0.0,
         **kwargs: Any,
     ) -> None:
-        check_level(positive_above)
+        positive_above = check(LEVEL, positive_above=positive_above)
         # Positional as in TorchRL: dtype, reduction, max_priority_within_buffer, device.
         if len(args) < 3:
             kwargs.setdefault("max_priority_within_buffer", True)

@@ -96,9 +96,9 @@ class TreeSampler(SavedTrees):
         # Until a storage is known there is one slot.
         self._takes_capacity = max_capacity is None
         capacity = 1 if max_capacity is None else max_capacity
-        check_counts(max_capacity=capacity)
-        check(_ALPHA, alpha=alpha)
-        check(NOT_NEGATIVE, beta=beta, eps=eps)
+        capacity = check_counts(max_capacity=capacity)
+        alpha = check(_ALPHA, alpha=alpha)
+        beta, eps = check(NOT_NEGATIVE, beta=beta, eps=eps)
         if dtype not in (torch.float, torch.double):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.stratified = stratified
@@ -168,9 +168,9 @@ class TreeSampler(SavedTrees):
 
     @alpha.setter
     def alpha(self, value: float) -> None:
-        check(_ALPHA, alpha=value)
+        value = float(check(_ALPHA, alpha=value))
         self._check_alpha(value)
-        before, self._alpha = self._alpha, float(value)
+        before, self._alpha = self._alpha, value
         if value != before:
             self._retransform_priority_trees(before, value)
 
@@ -193,8 +193,7 @@ class TreeSampler(SavedTrees):
 
     @beta.setter
     def beta(self, value: float) -> None:
-        check(NOT_NEGATIVE, beta=value)
-        self._beta = float(value)
+        self._beta = float(check(NOT_NEGATIVE, beta=value))
 
     @property
     def _max_priority(self) -> tuple[float | None, int | None]:
@@ -232,7 +231,7 @@ class TreeSampler(SavedTrees):
 
         They include eps and precede alpha, and are NaN where nothing was written.
         """
-        return self._priorities.clone() if index is None else self._priorities[index]
+        return self._priorities.clone() if index is None else self._priorities[as_slots(index)]
 
     @property
     def divisible(self) -> bool:

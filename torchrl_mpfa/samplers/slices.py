@@ -95,10 +95,9 @@ class SignalSliceSampler(SignalSampler):
         truncated_key: NestedKey | None = ("next", "truncated"),
         **kwargs: Any,
     ) -> None:
-        check_counts(slice_len=slice_len)
         if slice_priority not in get_args(SlicePriority):
             raise ValueError(unknown("slice_priority", slice_priority, get_args(SlicePriority)))
-        self.slice_len = slice_len
+        self.slice_len: int = check_counts(slice_len=slice_len)
         self.slice_priority: SlicePriority = slice_priority
         self.strict_length = strict_length
         self.end_key, self.traj_key = end_key, traj_key

@@ -296,7 +296,5 @@ def _not_negative(signal: Signal, value: Tensor) -> Tensor:
     priority = (signal.priority or torch.abs)(value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):
-        wanted = "be finite" if low >= 0 else "not be negative"
-        bad = priority[~((priority >= 0) & (priority < math.inf))][0].item()
-        raise ValueError(f"signal {signal.name!r} must {wanted}, got {bad}")
+        check_finite(f"signal {signal.name!r}", priority)
     return priority

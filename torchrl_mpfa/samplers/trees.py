@@ -10,6 +10,8 @@ from tensordict import is_tensor_collection
 from torch import Tensor
 from torchrl.data import Storage
 
+from torchrl_mpfa.storages.schema import as_integers
+
 _ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
 
@@ -91,17 +93,11 @@ def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
 def as_slots(index: Any, storage: Any = None) -> Tensor:
     """Return flat slots ``[B]`` of slots, of places ``[B, D]``, or of a tuple of ``D`` places."""
     if isinstance(index, tuple):
-        index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
+        index = torch.stack([as_integers(each).reshape(-1) for each in index], -1)
     if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
         return index
-    slots = torch.as_tensor(index)
-    if slots.numel() == 0:
-        return slots.new_empty(0, dtype=torch.long)
-    # A mask would be read as slots 0 and 1.
-    if slots.dtype is torch.bool or slots.is_floating_point() or slots.is_complex():
-        raise TypeError(f"index must hold integers, got {slots.dtype}")
-    slots = slots.long()
-    if slots.ndim <= 1:
+    slots = as_integers(index)
+    if slots.ndim <= 1 or len(slots) == 0:
         return slots.reshape(-1)
     # Not the filled part of it: a batch may be from before the storage was emptied.
     shape = getattr(storage, "_total_shape", None)

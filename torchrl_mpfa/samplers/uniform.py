@@ -12,6 +12,7 @@ import torch
 from torchrl.data import RandomSampler, Storage
 
 from torchrl_mpfa.samplers.states import SavedSampler
+from torchrl_mpfa.storages.schema import as_integers
 
 
 class NewestSampler(SavedSampler, RandomSampler):
@@ -39,7 +40,7 @@ class NewestSampler(SavedSampler, RandomSampler):
         self._record(index)
 
     def _record(self, index: Any) -> None:
-        places = torch.stack(index, -1) if isinstance(index, tuple) else torch.as_tensor(index)
+        places = torch.stack(index, -1) if isinstance(index, tuple) else as_integers(index)
         places = places.reshape(-1, places.shape[-1] if places.ndim > 1 else 1)
         # TorchRL's writers mark with -1 what was not stored.
         stored = places[(places >= 0).all(-1)]

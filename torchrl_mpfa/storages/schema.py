@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Union
+from typing import Any, Union
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -65,6 +65,28 @@ def check_finite_entries(
         path = as_path(key)
         if isinstance(value, Tensor) and value.is_floating_point() and path not in allowed:
             _check_finite(value, lead, path)
+
+
+def as_index(index: Any) -> Any:
+    """Return the index in such an entry of an ensemble's batch; anything else as it is."""
+    if is_tensor_collection(index) and (index := index.get(INDEX_KEY, None)) is None:
+        raise TypeError(f"index must hold integers, got a tensordict without {INDEX_KEY!r}")
+    return index
+
+
+def as_integers(index: Any) -> Tensor:
+    """Return an index of any form but a tuple as a tensor of integers."""
+    index = as_index(index)
+    try:
+        found = torch.as_tensor(index)
+    except (RuntimeError, TypeError, ValueError):
+        raise TypeError(f"index must hold integers, got {index!r}") from None
+    if found.ndim and len(found) == 0:
+        return found.long()
+    # A mask would be read as slots 0 and 1, and tensordicts in a list as nothing.
+    if found.dtype is torch.bool or found.is_floating_point() or found.is_complex():
+        raise TypeError(f"index must hold integers, got {found.dtype}")
+    return found.long()
 
 
 def as_path(key: NestedKey) -> _Path:

@@ -9,6 +9,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
@@ -16,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import bounds, check_counts, generator_on
 from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
-from torchrl_mpfa.storages.schema import Schema
+from torchrl_mpfa.storages.schema import Schema, as_index
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -67,7 +68,7 @@ class SignalTensorStorage(LazyTensorStorage):
     _entries: _Entries
 
     def __init__(self, max_size: int, **kwargs: Any) -> None:
-        check_counts(max_size=max_size)
+        max_size = check_counts(max_size=max_size)
         for name in _MOVED.keys() & kwargs.keys():
             raise TypeError(f"{name} is no argument of a storage since 0.5: {_MOVED[name]}")
         super().__init__(max_size, **kwargs)
@@ -96,12 +97,13 @@ class SignalTensorStorage(LazyTensorStorage):
             low, high = bounds(index)
             if low >= 0 and high < len(self):
                 return _rows_of(self._storage, index)
-        rows = super().get(index)
+        rows = super().get(as_index(index))
         # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
         return rows.copy() if rows is self._storage and is_tensor_collection(rows) else rows
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Write transitions."""
+        cursor = as_index(cursor)
         if (
             set_cursor
             and type(data) is TensorDict
@@ -157,9 +159,14 @@ class SignalTensorStorage(LazyTensorStorage):
         self._settle_loaded()
 
     def dumps(self, path: str | Path) -> None:
-        """Save the data in a folder, with a checksum of each of its files."""
+        """Save the data in a folder, with checksums, or raise ``OSError`` if it is full."""
+        path = Path(path)
+        path.mkdir(exist_ok=True)
+        if is_tensor_collection(data := self._storage):
+            with NamedTemporaryFile(dir=path) as room:  # TorchRL asks for none.
+                allocate(room.name, data.bytes())
         super().dumps(path)
-        seal_dump(Path(path), Path(path))
+        seal_dump(path, path)
 
     def loads(self, path: str | Path) -> None:
         """Restore the data from a folder.
@@ -232,6 +239,7 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
     Raises:
         FileExistsError: If ``scratch_dir`` holds the files of an earlier storage and ``existsok``
             is false, or a living storage, of this process or another, uses it.
+        OSError: If the disk has no room for the files, at the first write too; nothing is stored.
 
     Examples:
         >>> import tempfile
@@ -259,10 +267,25 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
 
     def hold(self, table: SignalTable) -> None:
         """Hold a table of signals beside the data, in a file if they are in a folder."""
-        super().hold(table)
         if self._claim is not None:
+            allocate(self._file, 8 * table.rows.numel())
             mapped = np.memmap(self._file, np.float64, "r+", shape=tuple(table.rows.shape))
             table.move_to(torch.from_numpy(mapped))
+        super().hold(table)
+
+    def _init(self, data: Any) -> None:
+        super()._init(data)
+        entries = tree_leaves(self._storage)
+        files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
+        try:
+            for file in files:
+                allocate(file)
+        except OSError:
+            self._storage, self.initialized = None, False
+            for entry in entries:
+                if entry._filename is not None:
+                    Path(entry._filename).unlink()
+            raise
 
     def __getstate__(self) -> Any:
         state = {**super().__getstate__(), "_claim": None}
@@ -355,6 +378,19 @@ def _of_any_device(data: Any) -> Any:
     return copied
 
 
+def allocate(path: str | Path, size: int = 0) -> None:
+    """Reserve room on the disk for a file that is mapped to memory, or raise ``OSError``.
+
+    A write to a mapped file for which the disk has no room would kill the process.
+    """
+    with open(path, "r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size or os.path.getsize(path) or 1)
+        except OSError as error:
+            error.filename = str(path)
+            raise
+
+
 def _claimed(file: Path, *, existsok: bool) -> NDArray[np.float64]:
     """Map the begin of a file of signals, which is locked as long as the mapping lives."""
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -372,4 +408,5 @@ def _claimed(file: Path, *, existsok: bool) -> NDArray[np.float64]:
                 f"{file} is there from an earlier storage: pass existsok=True to overwrite it"
             )
         opened.truncate(0)
+        allocate(file, 8)
         return np.memmap(opened, dtype=np.float64, mode="w+", shape=(1,))

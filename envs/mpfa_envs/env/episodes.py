@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
 from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
@@ -74,7 +74,7 @@ class EpisodeSource:
         self.rejected = 0
         """Worlds of the generator that had no task."""
         self._config = config
-        least, most = config.min_goal_distance, max_goal_distance
+        least, most = config.min_goal_distance, plain(max_goal_distance)
         if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
             raise ValueError(
                 f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
@@ -86,7 +86,7 @@ class EpisodeSource:
         self._split = split
         self._generator = _generator_of(world)
         if difficulty is not None:
-            check_share("difficulty", difficulty)
+            difficulty = check_share("difficulty", difficulty)
             if self._generator is None:
                 raise ValueError(
                     "difficulty must be None unless world is the name of a generator, got "

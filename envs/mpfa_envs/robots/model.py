@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean
+from mpfa_envs.checks import check_count, check_number, check_positive, did_you_mean, keep
 from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
@@ -96,9 +96,8 @@ class RobotModel:
                 continue
             if value is None and field.name in ("wheel_acceleration", "turn_limit"):
                 continue
-            if not isinstance(value, (int, float)):
-                raise ValueError(f"{field.name} must be a finite number, got {value!r}")
             (check_number if field.name == "min_wheel_speed" else check_positive)(field.name, value)
+        keep(self, *(field.name for field in fields(self)[1:-1]))
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_not_negative, check_number, check_share
+from mpfa_envs.checks import check_count, check_not_negative, check_number, check_share, keep
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -60,6 +60,7 @@ class RobotNoise:
         if not 0.0 <= check_number("slip", self.slip) <= _MOST_SLIP:
             raise ValueError(f"slip must be in [0, {_MOST_SLIP}], got {self.slip!r}")
         check_count("latency", self.latency, least=0)
+        keep(self, *vars(self))
 
     def times(self, factor: float) -> RobotNoise:
         """Scale all errors.

@@ -53,13 +53,12 @@ class Controller:
         odometry_timeout: float = 0.5,  # [s]
         check_period: float = 0.05,  # longest time from one tick() to the next [s]
     ) -> None:
-        check_not_negative("stop_distance", stop_distance)
         self.pilot = pilot
-        self.stop_distance = stop_distance
+        self.stop_distance = check_not_negative("stop_distance", stop_distance)
         self.scan_timeout = check_positive("scan_timeout", scan_timeout)
         self.odometry_timeout = check_positive("odometry_timeout", odometry_timeout)
         self.check_period = check_positive("check_period", check_period)
-        self._sight = Sight(pilot, stop_distance)
+        self._sight = Sight(pilot, self.stop_distance)
         self._track = Track(pilot.robot, scan_timeout)
         self._ordered = 0.0, 0.0
         self._ticked, self._passed = -math.inf, 0.0

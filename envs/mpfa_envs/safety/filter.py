@@ -84,7 +84,6 @@ class SafetyFilter:
         samples: int = 9,
     ) -> None:
         self.robot = resolve_robot(robot)
-        check_not_negative("clearance", clearance)
         self._parts = observation_slices(sectors, memory=memory, history=history)
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
@@ -99,7 +98,7 @@ class SafetyFilter:
             self.robot.wheel_limits,
             self.robot.wheel_base,
             self.robot.radius,
-            clearance,
+            check_not_negative("clearance", clearance),
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
         )

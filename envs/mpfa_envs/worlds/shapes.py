@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from mpfa_envs.checks import all_finite
+from mpfa_envs.checks import all_finite, keep
 
 Point = tuple[float, float]
 """A position (x, y) [m]."""
@@ -49,6 +49,7 @@ class Box:
     def __post_init__(self) -> None:
         if not all_finite((self.x_min, self.y_min, self.x_max, self.y_max)):
             raise ValueError(f"box must have finite edges, got {self}")
+        keep(self, "x_min", "y_min", "x_max", "y_max")
         if self.x_min >= self.x_max or self.y_min >= self.y_max:
             raise ValueError(f"box must have x_min < x_max and y_min < y_max, got {self}")
 
@@ -83,6 +84,7 @@ class Cylinder:
     def __post_init__(self) -> None:
         if not all_finite((self.x, self.y, self.radius)):
             raise ValueError(f"cylinder must have finite numbers, got {self}")
+        keep(self, "x", "y", "radius")
         if self.radius <= 0:
             raise ValueError(f"cylinder must have a positive radius, got {self}")
 

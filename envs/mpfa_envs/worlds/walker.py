@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from mpfa_envs.checks import all_finite
+from mpfa_envs.checks import all_finite, keep
 from mpfa_envs.worlds.shapes import Point
 
 Behavior = Literal["straight", "waypoints", "orca"]
@@ -73,6 +73,7 @@ class Walker:
             raise ValueError(f"radius must be at least {_NARROWEST} m, got {self.radius!r}")
         if not (all_finite((self.speed,)) and 0.0 < self.speed <= FASTEST):
             raise ValueError(f"speed must be above 0 and at most {FASTEST:g}, got {self.speed!r}")
+        keep(self, "radius", "speed")
         if self.behavior not in get_args(Behavior):
             raise ValueError(f"behavior must be one of {get_args(Behavior)}, got {self.behavior!r}")
         try:

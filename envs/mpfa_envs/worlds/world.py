@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs.checks import all_finite, check_positive
+from mpfa_envs.checks import all_finite, check_positive, plain
 from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Point, Polygon, Shape
 from mpfa_envs.worlds.walker import MOST_WALKERS, Walker
@@ -121,7 +121,7 @@ class World:
         if not all_finite(size or (math.nan,)):
             raise ValueError(f"size must be two positive lengths, got {self.size}")
         # The dataclass is frozen; these are its only changes, before it is used.
-        object.__setattr__(self, "size", size)
+        object.__setattr__(self, "size", tuple(map(plain, size)))
         for field, kind in _PARTS.items():
             given = getattr(self, field)
             parts = tuple(given) if isinstance(given, Iterable) else (given,)

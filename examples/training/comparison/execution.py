@@ -17,6 +17,7 @@ from torchrl_mpfa import Stop
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
 from training.comparison.workers import LocalWorker, Lost, Worker
+from training.inherited import forget_single_run
 
 LOG = "output.log"
 """Output of the scripts, in the folder of a run."""
@@ -155,6 +156,7 @@ class Work(ABC, Generic[Item]):
 
     def run(self) -> Stop:
         """Make all items, some at a time; return how that was stopped."""
+        forget_single_run()
         stop = Stop("saving the runs; the same command continues them", write=tqdm.write)
         with stop.listening():
             try:
@@ -232,6 +234,8 @@ def make_runs(
     if a run failed, 128 and the number of the signal that stopped it.
     """
     jobs, wanted = comparison.jobs, comparison.evaluation
+    for job in jobs:
+        files.check_folder(job.path)
     with files.lock(comparison.folder):
         others = other_than_asked(jobs, comparison.settings)
         if others and not anew:

@@ -82,7 +82,7 @@ class Job:
         own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
         # The runs that differ by their seeds alone are one group in wandb.
         group = f"{self.folder.name}/{self.name.removesuffix(f'-{self.seed}')}"
-        own += [f"run_dir={self.path}", f"tracking.group={group[:128]}"]
+        own += [f"run_dir={self.path}", f"tracking.group={files.short_name(group, 128)}"]
         return [*own, *with_defaults(self.arm.over(overrides))]
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:

@@ -20,6 +20,9 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
+from torchrl_mpfa.stopping import SIGNALS
+from training.inherited import forget_single_run
+
 Command = tuple[list[str], str]
 """A script with its arguments, and the file that its output is appended to."""
 
@@ -108,8 +111,11 @@ def _work(sent: Connection, statuses: Connection) -> None:
     """Run scripts until the program that sends them is gone, or one was asked to stop."""
     # Ctrl-C goes to the parent alone, which says when they stop.
     os.setsid()
-    # Where a script does not say how it ends by it: in good order as well.
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    # Where a script does not say how it ends by one: in good order as well.
+    for number in set(SIGNALS) - {signal.SIGINT}:
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
+    # Another machine has an environment of its own.
+    forget_single_run()
     commands: SimpleQueue[Command | None] = SimpleQueue()
     threading.Thread(target=_listen, args=(sent, commands), daemon=True, name="lifeline").start()
     try:

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,6 +22,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.finished import after_the_end, is_finished
+from training.inherited import forget_single_run
 from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
@@ -69,7 +70,10 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
             )
         for settings in runs:
             files.check_folder(Path(settings.run_dir))
-    except ValueError as error:
+        for text in arguments:
+            if text.startswith(("hydra.sweep.dir=", "hydra.sweep.subdir=", "hydra.run.dir=")):
+                files.check_name(Path(text.partition("=")[2]))
+    except (ValueError, OSError) as error:
         _exit(error)
     if resumes:
         _end_with(lambda: resume(Path(str(folders[-1])), overrides, hooks))
@@ -77,6 +81,9 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
         _end_with(lambda: start(runs[0], Path(runs[0].run_dir), hooks))
     else:
         # Sweeps, and Hydra's other modes; Hydra composes the settings once more.
+        if len(runs) > 1:
+            forget_single_run()
+
         def run(config: DictConfig) -> None:
             folder = Path(HydraConfig.get().runtime.output_dir)
             _end_with(lambda: start(as_settings(config), folder, hooks))
@@ -207,10 +214,12 @@ def _train(training: TrainingRun) -> int:
     from training.figures import plot_learning_curve
 
     curve = folder / files.CURVE
-    if training.records:
-        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
-    if histograms := training.log.history.histograms():
-        plot_histograms(histograms, folder / files.HISTOGRAMS)
+    # A disk that was full for the checkpoint is so for a chart.
+    with suppress(*([] if failure is None else [OSError])):
+        if training.records:
+            plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+        if histograms := training.log.history.histograms():
+            plot_histograms(histograms, folder / files.HISTOGRAMS)
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
@@ -262,6 +271,8 @@ def outside_cause(error: Exception) -> str | None:
             "not enough memory for method.capacity, learner.width, method.batch_size and robots "
             f"as they are ({how_much})"
         )
+    if (full := files.full_disk(error)) is not None:
+        return full
     kinds = {kind.__name__ for kind in type(error).__mro__}
     # By name, as Ray is an extra; its RayTaskError is an error in what a worker did.
     if "RayError" in kinds and "RayTaskError" not in kinds:

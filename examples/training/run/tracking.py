@@ -16,6 +16,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 
 from training import files
+from training.inherited import with_environment
 from training.pictures import trajectories_of
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.checkpoints import read_checkpoint
@@ -50,7 +51,7 @@ class Tracker(Hook):
     ) -> None:
         # A sweep has given its run an id.
         self.run_id = run_id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
-        wanted = settings.tracking
+        wanted = with_environment(settings.tracking)
         self._pictures = wanted.pictures_every is not None
         self._logs: list[Log] = []
         self.upload = upload_command(wanted, folder, self.run_id)
@@ -155,6 +156,8 @@ def log_evaluation(
 
     state = read_checkpoint(run)
     settings, total = as_settings(state["settings"]), table.iloc[-1]
+    if with_environment(settings.tracking).mode == "off":
+        return None
     entries: dict[str, Any] = {f"evaluate/{name}/{rate}": float(total[rate]) for rate in _RATES}
     entries[f"evaluate/{name}/worlds"] = table
     if picture.exists():

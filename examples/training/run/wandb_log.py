@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 import wandb
 
+from training.files import short_name
 from training.settings.train import TrainSettings, plain_settings
 
 AXIS = "actions"
@@ -47,7 +48,7 @@ class WandbLog:
                 id=run_id,
                 resume="allow",
                 name=folder.name,
-                group=settings.tracking.group or "-".join(parts)[:128],
+                group=settings.tracking.group or short_name("-".join(parts), 128),
                 job_type="train",
                 tags=[part[:64] for part in (*parts, settings.regime)],
                 mode=settings.tracking.mode,  # type: ignore[arg-type]
@@ -84,8 +85,8 @@ class WandbLog:
 
     def keep(self, file: Path, card: Mapping[str, Any]) -> None:
         """Keep a policy as an artifact, whose versions are those of runs with the same name."""
-        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}", flags=re.ASCII)[:128]
-        artifact = wandb.Artifact(name, type="policy", metadata=dict(card))
+        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}", flags=re.ASCII)
+        artifact = wandb.Artifact(short_name(name, 128), type="policy", metadata=dict(card))
         artifact.add_file(str(file))
         self._run.log_artifact(artifact)
 

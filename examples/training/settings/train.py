@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, Rule
 from torchrl_mpfa.methods import METHODS, MPFA, Method, method_named
+from training.files import short_name
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import (
     DQNSettings,
@@ -358,8 +359,8 @@ GROUPS: dict[str, dict[str, Any]] = {
 
 @cache
 def _one_folder(settings: str) -> str:
-    """Return the name of the folder of a run, in which a value may be a path."""
-    return settings.replace("/", "_")
+    """Return the name of the folder of a run, in which a value may be a path, or all too long."""
+    return short_name(settings.replace("/", "_"))
 
 
 def register() -> None:

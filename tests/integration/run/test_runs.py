@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ from hydra import compose, initialize_config_module
 import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
+from torchrl_mpfa.stopping import SIGNALS
 from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
@@ -331,6 +333,27 @@ def test_a_killed_run_goes_on_and_signals_save(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_run_whose_disk_is_full_says_so_in_one_line_and_how_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
+
+    def train_on(run: TrainingRun) -> bool:
+        save(run)
+        run.records = [object()]  # type: ignore[list-item]
+        full()
+        return True
+
+    monkeypatch.setattr(TrainingRun, "train", train_on)
+    monkeypatch.setattr("training.run.script.as_table", full)
+    assert begin(tmp_path) == 1
+    out, err = capsys.readouterr()
+    words = "checkpoint.pt cannot be written, No space left on device: free some of its disk"
+    assert err.splitlines()[-1] == f"train.py: {words}"
+    assert f"continue with: train.py resume={tmp_path}" in out
+
+
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
     saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -350,7 +373,7 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
 
 
 @pytest.mark.parametrize(
-    "number", mostly_slow([signal.SIGINT, signal.SIGTERM, signal.SIGHUP], [signal.SIGTERM])
+    "number", mostly_slow([*SIGNALS], [signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2])
 )
 def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
