@@ -21,7 +21,6 @@ from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
-from torchrl_mpfa.transforms import KEPT
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
 _MISSING = (
@@ -285,19 +284,20 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of all parts as in TorchRL, and the memory of the transforms.
+        """Return the state of all parts as in TorchRL.
 
         As in TorchRL the data are not copied: save or copy the state before more is written, after
         which the state is rejected.
         """
         with self._replay_lock:
             # The data are not copied: the clock shows that they are no longer those of the state.
-            state = {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
-            return {**state, KEPT: self._memory.state_dict()}
+            return {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
 
     @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore storage, signals, priorities, writer, generator, and memory of the transforms.
+        """Restore storage, signals, priorities, writer, transforms and generator.
+
+        Steps that wait in a transform that does not save them are lost, as in TorchRL's of n steps.
 
         Raises:
             KeyError: If an entry is missing; nothing is changed, but if the storage lacks it the
@@ -340,15 +340,15 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             generator.set_state(numbers)
         sampler = self.sampler  # Made here, if the parts were put off to their first use.
         with self._replay_lock, self._write_lock:
-            before = deepcopy(self._transform.state_dict()), self._memory.state_dict()
+            before = deepcopy(self._transform.state_dict()), self._memory.copies()
             try:
+                # No step that waits may join those of the state.
+                self._memory.empty()
                 self._transform.load_state_dict(state["_transforms"])
-                # TorchRL's buffer saves none.
-                self._memory.load_state_dict(state.get(KEPT, {}))
                 load("sampler", sampler)
             except BaseException:
                 self._transform.load_state_dict(before[0])
-                self._memory.load_state_dict(before[1])
+                self._memory.set_back(before[1])
                 raise
             if state.get(_CLOCK) is not self._clock:
                 # States that share the clock are no longer of these data.
@@ -391,7 +391,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             source = self._rng
             state = {
                 "_transforms": self._transform.state_dict(),
-                KEPT: self._memory.state_dict(),
                 _TIME: self._clock[0],
                 "_batch_size": self._batch_size,
                 "_consume_after_n_samples": self._consume_after_n_samples,
