@@ -14,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from torchrl.objectives import DDPGLoss
 from torchrl.trainers import Trainer
 
 from tests.integration.test_torchrl_trainer import assert_learned
@@ -82,7 +83,7 @@ def test_the_policy_that_collects_has_the_weights_that_were_learned() -> None:
 
 
 def test_two_runs_of_one_seed_are_the_same() -> None:
-    first, second = (tiny("seed=3").replay_buffer.storage.signal_table.rows for _ in range(2))
+    first, second = (tiny("seed=3").replay_buffer.sampler.table.rows for _ in range(2))
     assert first.nan_to_num(-1).equal(second.nan_to_num(-1))
 
 
@@ -118,9 +119,16 @@ def test_torchrls_own_networks_fit_the_loss() -> None:
     assert_learned(trainer)
 
 
-def test_a_storage_without_signals_is_rejected_by_name() -> None:
-    with pytest.raises(Exception, match=r"storage must keep signals.*got LazyTensorStorage"):
-        tiny("storage._target_=torchrl.data.LazyTensorStorage")
+def test_loss_and_storage_of_torchrl_learn_by_all_signals() -> None:
+    trainer = tiny(
+        "storage._target_=torchrl.data.LazyTensorStorage",
+        "loss._target_=torchrl.objectives.DDPGLoss",
+        *(f"~loss.{name}" for name in ("actor", "critic", "reward_scale")),
+        "+loss.actor_network=${policy}",
+        "+loss.value_network=${critic}",
+    )
+    assert type(trainer.loss_module) is DDPGLoss
+    assert_learned(trainer)
 
 
 def test_the_configuration_of_the_page_builds_a_buffer() -> None:

@@ -124,7 +124,9 @@ class HindsightGoals(Transform):
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return the steps of unfinished episodes, as part of the state of the buffer."""
-        return dict(torch.cat(self._pending).items(True, True)) if self._pending else {}
+        if not self._pending:
+            return {}
+        return dict(cast(TensorDictBase, torch.cat(self._pending)).items(True, True))
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restore the steps of unfinished episodes.
