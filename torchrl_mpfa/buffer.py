@@ -44,7 +44,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
     TorchRL's buffer reduces the signals of a batch to one number per transition. This buffer reads
     each signal that the sampler fuses, drops the rows whose slot was overwritten since they were
     sampled, and hands the rest on. Transitions that do not fit the stored ones are rejected before
-    any of them is written.
+    any of them is written. With TorchRL's storage and sampler it is TorchRL's buffer.
 
     Signals are read when a transition is written. Entries of stored transitions cannot be changed
     in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``, ``buffer[key] = ...``).

@@ -42,7 +42,10 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
 
     def _checks(self, data: Any) -> bool:
         # Not the attribute: the property has the parts made, where that was put off to their use.
-        return not isinstance(self.sampler, ConsumingSampler) and isinstance(data, TensorDictBase)
+        sampler = self.sampler
+        ours = isinstance(sampler, SignalSampler) or isinstance(self._storage, SignalTensorStorage)
+        consumes = isinstance(sampler, ConsumingSampler)
+        return ours and not consumes and isinstance(data, TensorDictBase)
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
@@ -234,7 +237,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         super().__setitem__(index, value)
         self._clock[0] += 1
         # A storage of this package says so itself, whoever writes in it.
-        if not isinstance(self._storage, SignalTensorStorage):
+        fuses = isinstance(self._sampler, SignalSampler)
+        if fuses and not isinstance(self._storage, SignalTensorStorage):
             self.mark_update(slots_of(self._storage, index))
 
     def _write_in_place(self, *args: Any, **kwargs: Any) -> NoReturn:

@@ -20,6 +20,7 @@ from tests.mpfa.transitions import (
 )
 from torchrl_mpfa import (
     MPFASampler,
+    SignalReplayBuffer,
     SignalSliceSampler,
     SignalTensorStorage,
 )
@@ -58,6 +59,14 @@ def test_a_storage_of_torchrl_gives_the_same_batches_and_priorities(kind, write)
     again = make_buffer(16, storage=kind(16), seed=3)
     again.load_state_dict(snapshot(theirs))
     assert train_rounds(ours, 2).equal(train_rounds(again, 2))
+
+
+def test_trajectories_in_a_list_of_torchrl_s_stay_whole():
+    trajectories = TensorDict({"observation": torch.rand(3, 4, 5)}, [3, 4])
+    buffer = SignalReplayBuffer(sampler=TreeSampler(5, 0.7, 0.9), batch_size=3)
+    buffer.extend(trajectories)
+    assert len(buffer) == 3
+    assert buffer.sample()["observation"].shape == (3, 4, 5)
 
 
 @pytest.mark.parametrize("storage", [SignalTensorStorage, LazyTensorStorage])
