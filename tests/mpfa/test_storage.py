@@ -198,8 +198,9 @@ def test_reading_a_slot_that_was_never_written_is_an_error(make_storage):
         storage.get(torch.tensor([1, 5]))
 
 
-def test_entries_that_are_no_tensors_come_back():
-    storage = SignalTensorStorage(4)
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_entries_that_are_no_tensors_come_back(kind):
+    storage = kind(4)
     data = make_transitions(3)
     data.set_non_tensor("world", "A")
     storage.set(torch.arange(3), data)

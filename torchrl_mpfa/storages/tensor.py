@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Union
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
@@ -275,7 +275,9 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
 
     def _init(self, data: Any) -> None:
         super()._init(data)
-        entries = tree_leaves(self._storage)
+        # Texts and the like are kept in memory.
+        leaves = tree_leaves(self._storage)
+        entries = [entry for entry in leaves if isinstance(entry, MemoryMappedTensor)]
         files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
         try:
             for file in files:
