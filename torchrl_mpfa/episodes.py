@@ -13,8 +13,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.storages.schema import as_path
-from torchrl_mpfa.storages.table import SignalTable
 
 _NOT_OBSERVED = {"reward", "done", "terminated", "truncated"}
 _STEPS = "steps_to_next_obs"
