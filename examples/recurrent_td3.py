@@ -218,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> Actor:
     )
     size = env.observation_spec["observation"].shape[-1]
     buffer = mpfa.SignalReplayBuffer(
-        storage=mpfa.SignalTensorStorage(CAPACITY, ndim=2, signals=["td_error"]),
+        storage=mpfa.SignalTensorStorage(CAPACITY, ndim=2),
         sampler=mpfa.SignalSliceSampler(
             CAPACITY,
             alpha=0.6,

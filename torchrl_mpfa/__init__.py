@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torchrl_mpfa.losses import make_ddpg_loss as make_ddpg_loss
     from torchrl_mpfa.losses import make_sac_loss as make_sac_loss
     from torchrl_mpfa.losses import make_td3_loss as make_td3_loss
+    from torchrl_mpfa.losses import write_signals as write_signals
     from torchrl_mpfa.networks import make_actor as make_actor
     from torchrl_mpfa.networks import make_critic as make_critic
     from torchrl_mpfa.networks import make_stochastic_actor as make_stochastic_actor
@@ -57,7 +58,7 @@ _NAMES = {
     ),
     "losses": (
         "SignalDDPGLoss SignalDQNLoss SignalSACLoss SignalTD3Loss make_ddpg_loss make_sac_loss "
-        "make_td3_loss"
+        "make_td3_loss write_signals"
     ),
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "samplers": "MPFASampler SignalSampler SignalSliceSampler",

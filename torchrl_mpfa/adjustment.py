@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl_mpfa.checks import BELOW_ONE, LEVEL, POSITIVE, Rule, keep
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.storages.table import SignalTable
+    from torchrl_mpfa.samplers.table import SignalTable
 
 Level = float | Literal["mean"]
 """A reward, or ``"mean"``: the mean reward of the buffer."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
@@ -19,10 +20,8 @@ from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_gener
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
-from torchrl_mpfa.storages.schema import as_integers, as_path
-from torchrl_mpfa.storages.table import SignalTable
-from torchrl_mpfa.transforms import KEPT
-from torchrl_mpfa.writes import CheckedReplayBuffer
+from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
+from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
 _MISSING = (
     "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
@@ -33,6 +32,8 @@ _FILE = "buffer.pt"
 """File of a dump with the state of all that has no folder."""
 _FOLDERS = ("storage", "sampler", "writer")
 """Parts that save themselves in folders of a dump."""
+_CLOCK, _TIME = "_clock", "_time"
+"""Entries of a state: the count of writes as it is now, and as it was."""
 _UNRETURNED = 100
 """Batches in a row without an update of priorities after which a warning is given."""
 
@@ -42,21 +43,22 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     TorchRL's buffer reduces the signals of a batch to one number per transition. This buffer reads
     each signal that the sampler fuses, drops the rows whose slot was overwritten since they were
-    sampled, and hands the rest on. With any other storage it is TorchRL's buffer.
+    sampled, and hands the rest on. Transitions that do not fit the stored ones are rejected before
+    any of them is written. With TorchRL's storage and sampler it is TorchRL's buffer.
 
     Signals are read when a transition is written. Entries of stored transitions cannot be changed
     in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``, ``buffer[key] = ...``).
 
     Args:
+        allow_nonfinite: Entries that may hold NaN and infinities; none by default.
         generator: Source of all randomness of the buffer; by default a new one, seeded by
             ``torch.manual_seed``. Its state is saved with the buffer.
         **kwargs: Passed to :class:`~torchrl.data.TensorDictReplayBuffer`.
 
     Raises:
-        TypeError: If the sampler fuses signals and the storage keeps none, or ``generator`` is no
-            generator.
+        TypeError: If ``generator`` is no generator.
         ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` is not None or 0, or
-            capacity or signals of sampler and storage differ; or, where signals are fused, if
+            the capacities of sampler and storage differ; or, where signals are fused, if
             ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
 
     Examples:
@@ -78,7 +80,15 @@ class SignalReplayBuffer(CheckedReplayBuffer):
     takes_signals = True
     """Priorities come back as signals, of several batches in one call."""
 
-    def __init__(self, *, generator: torch.Generator | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *,
+        allow_nonfinite: Sequence[NestedKey] = (),
+        generator: torch.Generator | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self._allow_nonfinite = tuple(allow_nonfinite)
+        self._clock = [0]
         self.stale_updates = 0
         self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
@@ -96,29 +106,34 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     def _initialize_prioritized_sampler(self) -> None:
         # As long as TorchRL can still undo what it has made: it may have put that off to this use.
-        super()._initialize_prioritized_sampler()
         if self._fuses:
-            self._check_priority_key(self._sampler.bind(self._storage))
-            if not isinstance(self._sample_unit, Transition | None):
-                raise ValueError(
-                    "sample_unit must be None with a sampler that fuses signals, got "
-                    f"{type(self._sample_unit).__name__}: signals belong to single transitions, "
-                    "and SignalSliceSampler samples slices of them"
-                )
-            if self._batch_size is not None:
-                self._sampler.check_batch_size(self._batch_size)
-            self._storage.needs_signals = True
-            self._storage.needed_keys = self._sampler.needed_keys
-            self._storage.mask_keys = self._sampler.mask_keys
-        if self._checks:
-            self._storage.strict = True
+            self._check_fusing_parts()
+        super()._initialize_prioritized_sampler()
+        if self._fuses and len(self._storage):
+            slots = torch.arange(len(self._storage))
+            self._sampler.mark_update(slots, storage=self._storage)
 
-    def _check_priority_key(self, table: SignalTable) -> None:
+    def _check_fusing_parts(self) -> None:
+        """Reject parts that do not go together with a sampler that fuses signals."""
+        sampler, size = self._sampler, self._storage.max_size
+        table = sampler.attach(self._storage)
+        if sampler.max_size != size:
+            raise ValueError(
+                f"max_capacity of the sampler is {sampler.max_size}, max_size of the storage {size}"
+            )
         if as_path(self.priority_key) in map(as_path, table.read_keys):
             raise ValueError(
                 f"priority_key must not be the key of a reward or a signal, got "
                 f"{self.priority_key!r}: first priorities are not stored with the transitions"
             )
+        if not isinstance(self._sample_unit, Transition | None):
+            raise ValueError(
+                "sample_unit must be None with a sampler that fuses signals, got "
+                f"{type(self._sample_unit).__name__}: signals belong to single transitions, "
+                "and SignalSliceSampler samples slices of them"
+            )
+        if self._batch_size is not None:
+            sampler.check_batch_size(self._batch_size)
 
     @property
     def _fuses(self) -> bool:
@@ -239,8 +254,10 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     def rewards(self) -> Tensor:
         """Return the rewards of all transitions, shape ``[N]``."""
-        found: Tensor = self.storage.signal_table.rewards
-        return found
+        if self._fuses:
+            rewards: Tensor = self._sampler.table.rewards
+            return rewards
+        return self[:][REWARD_KEY].reshape(len(self)).double()
 
     def distributions(self) -> dict[str, Tensor]:
         """Return numbers of all transitions by name, each of shape ``[N]``.
@@ -253,7 +270,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         if not isinstance(sampler, TreeSampler) or not size:
             return {}
         found = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
-        table = getattr(self.storage, "signal_table", None)
+        table = getattr(sampler, "table", None)
         if table is not None:
             found |= {name: table.rows[:size, column] for name, column in table.column.items()}
         return found
@@ -263,21 +280,30 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         with self._replay_lock:
             found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
-                found.update(self._sampler.stats(self._storage))
+                found.update(self._sampler.stats())
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of all parts as in TorchRL, and the memory of the transforms."""
+        """Return the state of all parts as in TorchRL.
+
+        As in TorchRL the data are not copied: save or copy the state before more is written, after
+        which the state is rejected.
+        """
         with self._replay_lock:
-            return {**super().state_dict(), KEPT: self._memory.state_dict()}
+            # The data are not copied: the clock shows that they are no longer those of the state.
+            return {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
 
     @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore storage, signals, priorities, writer, generator, and memory of the transforms.
+        """Restore storage, signals, priorities, writer, transforms and generator.
+
+        Steps that wait in a transform that does not save them are lost, as in TorchRL's of n steps.
 
         Raises:
-            KeyError: If an entry is missing; nothing is changed.
-            ValueError: If the state of a part does not fit the part; nothing is changed.
+            KeyError: If an entry is missing; nothing is changed, but if the storage lacks it the
+                buffer is empty.
+            ValueError: If the state of a part does not fit the part; nothing is changed, but if
+                the part is the storage the buffer is empty.
         """
         check_saved("buffer", state_dict, ("_storage", "_sampler", "_writer"))
         kind = state_dict["_sampler"].get("_kind")
@@ -285,6 +311,11 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             # TorchRL's own would leave out what it does not know.
             raise ValueError(
                 f"the saved sampler is {kind!r}, this one a {type(self.sampler).__name__}"
+            )
+        if state_dict.get(_CLOCK) not in (None, [state_dict.get(_TIME)]):
+            raise ValueError(
+                "the buffer was written to since this state of it was made, whose data are the "
+                "buffer's own: save or copy a state before more is written"
             )
         # A writer of data that no one may write has no cursor, nor has its state.
         if hasattr(self._writer, "_cursor"):
@@ -298,7 +329,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self._load(state_dict, lambda name, part: part.load_state_dict(state_dict[f"_{name}"]))
 
     def _load(self, state: dict[str, Any], load: Callable[[str, Any], None]) -> None:
-        """Load all parts, storage and writer once the others have been found to fit."""
+        """Load all parts, the storage once the others have been found to fit."""
         check_saved("buffer", state, ("_transforms", "_batch_size", "_rng"))
         if state["_batch_size"] is not None:
             check_counts(batch_size=state["_batch_size"])
@@ -307,32 +338,46 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             numbers, device = state["_rng"]
             generator = torch.Generator(device=device)
             generator.set_state(numbers)
-        sampler: Any = self.sampler  # Made here, if the parts were put off to their first use.
+        sampler = self.sampler  # Made here, if the parts were put off to their first use.
         with self._replay_lock, self._write_lock:
-            before = deepcopy(self._transform.state_dict()), self._memory.state_dict()
-            # A sampler's load gives it new tensors: its twin shares none that is written in.
-            twin = object.__new__(type(sampler))
-            vars(twin).update(vars(sampler))
+            before = deepcopy(self._transform.state_dict()), self._memory.copies()
             try:
+                # No step that waits may join those of the state.
+                self._memory.empty()
                 self._transform.load_state_dict(state["_transforms"])
-                # TorchRL's buffer saves none.
-                self._memory.load_state_dict(state.get(KEPT, {}))
-                load("sampler", twin)
-                load("storage", self._storage)
+                load("sampler", sampler)
             except BaseException:
                 self._transform.load_state_dict(before[0])
-                self._memory.load_state_dict(before[1])
+                self._memory.set_back(before[1])
                 raise
-            vars(sampler).update(vars(twin))
-            load("writer", self._writer)
+            if state.get(_CLOCK) is not self._clock:
+                # States that share the clock are no longer of these data.
+                self._clock[0] = -1
+                self._clock = [state.get(_TIME, 0)]
+            try:
+                load("storage", self._storage)
+                self._check_loaded()
+                load("writer", self._writer)
+            except BaseException:
+                self.empty()
+                raise
             self._batch_size = state["_batch_size"]
             self._consume_after_n_samples = state.get("_consume_after_n_samples")
             if generator is not None:
                 self.set_rng(generator)
             # TorchRL keeps no record of what was written last.
             cursor = getattr(self._writer, "_cursor", None)
-            if self._checks and cursor is not None and len(self._storage):
+            if cursor is not None and len(self._storage) and not self._is_consuming():
                 self._storage._set_last_cursor((cursor - 1) % self._storage._len_along_dim0)
+
+    def _check_loaded(self) -> None:
+        """Reject loaded transitions that could not have been written."""
+        length = len(self._storage)
+        if self._fuses and self._sampler.table.size != length:
+            size = self._sampler.table.size
+            raise ValueError(f"the saved storage has {length} rows, its signals {size}")
+        if length and isinstance(data := self._storage[:], TensorDictBase):
+            check_finite_entries(data, self._storage.ndim, self._allow_nonfinite)
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder, whole or not at all, with a checksum of each file.
@@ -346,7 +391,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             source = self._rng
             state = {
                 "_transforms": self._transform.state_dict(),
-                KEPT: self._memory.state_dict(),
+                _TIME: self._clock[0],
                 "_batch_size": self._batch_size,
                 "_consume_after_n_samples": self._consume_after_n_samples,
                 "_rng": None if source is None else (source.get_state(), str(source.device)),
@@ -360,9 +405,9 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
         Raises:
             FileNotFoundError: If there is no such folder.
-            KeyError: If an entry is missing; nothing is changed.
-            ValueError: If a file is damaged, missing, or could execute something, or the state of a
-                part does not fit the part; nothing is changed.
+            KeyError: As :meth:`load_state_dict`.
+            ValueError: As :meth:`load_state_dict`; or if a file is damaged, missing, or could
+                execute something; nothing is changed.
         """
         folder = open_dump(path)
         state = load_safely(folder / _FILE)

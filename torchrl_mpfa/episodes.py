@@ -7,14 +7,17 @@ not.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_mpfa.storages.schema import as_path
-from torchrl_mpfa.storages.table import SignalTable
+
+if TYPE_CHECKING:
+    # The samplers import this module.
+    from torchrl_mpfa.samplers.table import SignalTable
 
 _NOT_OBSERVED = {"reward", "done", "terminated", "truncated"}
 _STEPS = "steps_to_next_obs"

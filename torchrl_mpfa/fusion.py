@@ -42,7 +42,7 @@ from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, Rule, check, check_finite, keep
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.storages.table import SignalTable
+    from torchrl_mpfa.samplers.table import SignalTable
 
 
 def binary_entropy(first: Tensor, second: Tensor) -> Tensor:

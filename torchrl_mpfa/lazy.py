@@ -8,9 +8,19 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+GONE = {
+    "torchrl_mpfa.integrations.hydra": "nothing: a Hydra file names each part as _target_",
+    "torchrl_mpfa.storages.SignalStorageMixin": "nothing: the sampler keeps the signals",
+    "torchrl_mpfa.storages.SignalTable": "torchrl_mpfa.samplers.SignalTable",
+}
+"""Names of 0.4 that went, with what replaces them: docs/from_0_4.md has all."""
+
 
 def find(package: str, name: str, module_of: Mapping[str, str]) -> Any:
     """Return a public name of a package from its module, or a module of the package."""
+    if instead := GONE.get(f"{package}.{name}"):
+        # An AttributeError would lose its text in ``from package import name``.
+        raise ImportError(f"{package}.{name} is no longer there since 0.5: use {instead}")
     if name in module_of:
         return getattr(import_module(f"{package}.{module_of[name]}"), name)
     # A module is an attribute of its package only once it was imported.

@@ -28,8 +28,8 @@ from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting, counts_buf
 from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.fusion import Annealed, Fusion
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.signals import Signal, as_signals
-from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.samplers.table import SignalTable
+from torchrl_mpfa.signals import Signal
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 _SAMPLES = 50_000
@@ -180,14 +180,14 @@ def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalRepl
     generator = torch.Generator().manual_seed(seed)
     capacity = sampler.max_size
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(capacity, signals=sampler.signals),
+        storage=SignalTensorStorage(capacity),
         sampler=sampler,
         batch_size=batch_size,
         generator=generator,
     )
     for count in (capacity, max(capacity // 3, 1)):
         data = TensorDict({"next": {"reward": torch.randn(count, 1, generator=generator)}}, [count])
-        for signal in as_signals(sampler.signals):
+        for signal in sampler.signals:
             if signal.known_at == "write" and data.get(signal.key, None) is None:
                 data.set(signal.key, torch.rand(count, generator=generator))
         buffer.extend(data)

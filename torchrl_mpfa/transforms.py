@@ -1,35 +1,34 @@
-"""Memory of a buffer's transforms from one write to the next: restored, saved and emptied."""
+"""What a buffer's transforms keep from one write to the next: set back, and emptied."""
 
 from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.transforms import Compose, MultiStepTransform, Transform
 
 from torchrl_mpfa.checks import as_mask
-from torchrl_mpfa.storages.schema import Schema, as_path
+from torchrl_mpfa.storages.schema import as_path, check_finite_entries
 
-KEPT = "_kept"
-"""Entry of a saved buffer with the memory of its transforms."""
 _AT_A_WRITE = ("inv", "_inv_call", "_inv_apply_transform")
 _OF_EVERY_MODULE = {*vars(nn.Module())}
-_LISTS: dict[str, type] = {"list": list, "tuple": tuple, "deque": deque}
 _Attributes = dict[str, Any]
 
 
 class TransformMemory:
-    """Attributes that writes change: transitions that transforms keep, numbers, texts.
+    """Attributes of a buffer's transforms, which a write that is rejected leaves as they were.
 
-    Tensors, tensordicts, lists and mappings of these count as changed by each write. The content of
-    a tuple is never written in place: it is not copied before each write.
+    What is to be saved, a transform hands on by PyTorch's ``get_extra_state``, as
+    :class:`~torchrl_mpfa.methods.her.HindsightGoals` does. The steps that wait in TorchRL's n-step
+    transform are lost at a load, and no others join what was loaded.
 
     Args:
         transform: The transforms of a buffer.
@@ -41,14 +40,14 @@ class TransformMemory:
         # By module, the values of its attributes before the first write that changed them.
         self._first: dict[nn.Module, _Attributes] = {}
 
-    def parts(self) -> dict[str, nn.Module]:
-        """Return the transforms that run at a write, and the modules in them, by name."""
-        return {
-            f"{place}.{name}": module
-            for place, each in enumerate(self._transform)
-            if _writes(each)
-            for name, module in each.named_modules()
-        }
+    def parts(self) -> list[nn.Module]:
+        """Return the transforms that run at a write, and the modules in them."""
+        writing = [transform for transform in self._transform if _writes(transform)]
+        return [module for transform in writing for module in transform.modules()]
+
+    def copies(self) -> dict[nn.Module, _Attributes]:
+        """Return copies of all attributes by module."""
+        return {part: _copied(_attributes(part)) for part in self.parts()}
 
     @contextmanager
     def transformed(self, data: TensorDictBase) -> Iterator[TensorDictBase | None]:
@@ -56,88 +55,55 @@ class TransformMemory:
 
         Attributes and random numbers are set back if anything raises inside of this.
         """
-        parts = [*self.parts().values()]
+        parts = self.parts()
         if not parts:
             yield self._transform.inv(data)
             return
         for part in parts:
             if part not in self._first:
                 _warn_of_steps_past_the_end(part)
-        before = [_attributes(part) for part in parts]
-        copies, random = [*map(_copied, before)], torch.get_rng_state()
-        sources = [v for own in before for v in own.values() if isinstance(v, torch.Generator)]
+        before = {part: _attributes(part) for part in parts}
+        copies, random = self.copies(), torch.get_rng_state()
+        sources = [v for own in before.values() for v in own.values()]
+        sources = [source for source in sources if isinstance(source, torch.Generator)]
         states = [source.get_state() for source in sources]
         try:
             # A copy: the caller may write into its own again.
-            made = self._transform.inv(_with_masks(data.clone(), parts))
-            for part, own, copy in zip(parts, before, copies, strict=True):
-                self._check_kept(part, own, copy)
-            yield made
+            rows = self._transform.inv(_with_masks(data.clone(), parts))
+            self._check_kept(before)
+            yield rows
         except BaseException:
-            for part, copy in zip(parts, copies, strict=True):
-                _replace(part, copy)
+            self.set_back(copies)
             torch.set_rng_state(random)
             for source, state in zip(sources, states, strict=True):
                 source.set_state(state)
             raise
-        for part, own, copy in zip(parts, before, copies, strict=True):
-            self._record(part, own, copy)
+        for part, attributes in before.items():
+            first = self._first.setdefault(part, {})
+            for name, value in _attributes(part).items():
+                if value is not attributes.get(name) or _is_written_in(value):
+                    first.setdefault(name, copies[part].get(name))
 
-    def _check_kept(self, part: nn.Module, before: _Attributes, copy: _Attributes) -> None:
-        """Reject transitions that a part keeps since a write."""
-        for name, value in _attributes(part).items():
-            if _holds(value):
-                known = before.get(name) if isinstance(value, tuple) else None
-                self._check(value, next(_rows(copy.get(name)), None), {*map(id, _rows(known))})
+    def _check_kept(self, before: dict[nn.Module, _Attributes]) -> None:
+        """Reject transitions that a part keeps since a write and that are not finite."""
+        for part, attributes in before.items():
+            for name, value in _attributes(part).items():
+                if value is not attributes.get(name) or _is_written_in(value):
+                    for rows in _rows(value):
+                        check_finite_entries(rows, rows.ndim, self._allowed)
 
-    def _record(self, part: nn.Module, before: _Attributes, copy: _Attributes) -> None:
-        """Record the attributes that a write has changed, with their values before it."""
-        first = self._first.setdefault(part, {})
-        for name, value in _attributes(part).items():
-            if _holds(value) or (_is_plain(value) and value is not before.get(name)):
-                first.setdefault(name, copy.get(name))
-
-    def _check(self, value: Any, like: TensorDictBase | None, known: set[int]) -> None:
-        """Reject kept transitions that are not finite, or unlike those before them."""
-        for rows in _rows(value):
-            if id(rows) not in known:
-                schema = Schema(rows if like is None else like, rows.ndim, self._allowed)
-                schema.check(rows, rows.ndim, whole=True)
+    def set_back(self, copies: dict[nn.Module, _Attributes]) -> None:
+        """Give modules the attributes that they had when these were copied."""
+        for part, attributes in copies.items():
+            for name in _attributes(part).keys() - attributes.keys():
+                delattr(part, name)
+            for name, value in attributes.items():
+                (part._buffers if name in part._buffers else vars(part))[name] = value
 
     def empty(self) -> None:
         """Give attributes the values that they had before any write."""
-        for part in self.parts().values():
-            _replace(part, _attributes(part) | _copied(self._first.get(part, {})))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the attributes that writes changed, as tensors and plain values."""
-        return {
-            name: {key: _packed(_attributes(part)[key]) for key in self._first[part]}
-            for name, part in self.parts().items()
-            if part in self._first
-        }
-
-    def load_state_dict(self, state: Any) -> None:
-        """Restore the memory of the same transforms.
-
-        Raises:
-            ValueError: If the state is of other transforms, or a saved transition is not finite.
-        """
-        parts = self.parts()
-        self.empty()
-        for name, saved in state.items() if isinstance(state, Mapping) else [("", state)]:
-            own = _attributes(parts[name]) if name in parts else {}
-            if not isinstance(saved, Mapping) or not saved.keys() <= own.keys():
-                raise ValueError(
-                    f"{KEPT!r} of the saved buffer must be of transforms {[*parts]}, got {name!r}"
-                )
-            found = {key: _unpacked(value) for key, value in saved.items()}
-            for value in found.values():
-                self._check(value, None, set())
-            self._first[parts[name]] = _copied({key: own[key] for key in found}) | self._first.get(
-                parts[name], {}
-            )
-            _replace(parts[name], own | found)
+        first = self._first.items()
+        self.set_back({part: _attributes(part) | _copied(own) for part, own in first})
 
 
 def _warn_of_steps_past_the_end(part: nn.Module) -> None:
@@ -172,26 +138,25 @@ def _with_masks(data: Any, parts: Sequence[nn.Module]) -> Any:
 
 
 def _attributes(part: nn.Module) -> _Attributes:
-    own = {name: each for name, each in vars(part).items() if name not in _OF_EVERY_MODULE}
+    own = {name: value for name, value in vars(part).items() if name not in _OF_EVERY_MODULE}
     return {**own, **part._buffers}
 
 
-def _replace(part: nn.Module, attributes: _Attributes) -> None:
-    for name in _attributes(part).keys() - attributes.keys():
-        delattr(part, name)
-    for name, value in attributes.items():
-        (part._buffers if name in part._buffers else vars(part))[name] = value
+def _is_written_in(value: Any) -> bool:
+    """Return True if a write may change a value in its place."""
+    return isinstance(value, Tensor | TensorDictBase | list | deque | dict)
 
 
-def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, bool | int | float | str)
-
-
-def _holds(value: Any) -> bool:
-    """Return True if a value is of tensors and tensordicts only."""
-    if isinstance(value, list | tuple | deque | dict):
-        return all(_holds(each) for each in (value.values() if type(value) is dict else value))
-    return isinstance(value, Tensor | TensorDictBase)
+def _copied(attributes: _Attributes) -> _Attributes:
+    """Return attributes with copies of what a write may change in its place."""
+    return {
+        name: value.clone()
+        if isinstance(value, Tensor | TensorDictBase)
+        else copy(value)
+        if _is_written_in(value)
+        else value
+        for name, value in attributes.items()
+    }
 
 
 def _rows(value: Any) -> Iterator[TensorDictBase]:
@@ -199,41 +164,5 @@ def _rows(value: Any) -> Iterator[TensorDictBase]:
     if isinstance(value, TensorDictBase):
         yield value
     elif isinstance(value, list | tuple | deque | dict):
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from _rows(each)
-
-
-def _copied(value: Any) -> Any:
-    """Return a copy of the tensors, lists and mappings in a value; tuples stay as they are."""
-    if isinstance(value, Tensor | TensorDictBase):
-        return value.clone()
-    if type(value) is dict:
-        return {key: _copied(each) for key, each in value.items()}
-    if isinstance(value, deque):
-        return deque(map(_copied, value), value.maxlen)
-    return [*map(_copied, value)] if type(value) is list else value
-
-
-def _packed(value: Any) -> Any:
-    """Return a value in a form that can be read without executing anything."""
-    if isinstance(value, TensorDictBase):
-        rows = {key: each.clone() for key, each in value.items(True, True)}
-        return {"rows": rows, "size": [*value.batch_size]}
-    if type(value) is dict:
-        return {"dict": {key: _packed(each) for key, each in value.items()}}
-    if (kind := type(value).__name__) in _LISTS:
-        return {kind: [*map(_packed, value)], "maxlen": getattr(value, "maxlen", None)}
-    return value.clone() if isinstance(value, Tensor) else value
-
-
-def _unpacked(value: Any) -> Any:
-    """Return a value as it was before :func:`_packed`."""
-    if not isinstance(value, Mapping):
-        return value.clone() if isinstance(value, Tensor) else value
-    kind, content = next(iter(value.items()))
-    if kind == "rows":
-        return TensorDict(dict(content), value["size"]).clone()
-    if kind == "dict":
-        return {key: _unpacked(each) for key, each in content.items()}
-    made = [_unpacked(each) for each in content]
-    return deque(made, value["maxlen"]) if kind == "deque" else _LISTS[kind](made)
+        for entry in value.values() if isinstance(value, dict) else value:
+            yield from _rows(entry)

@@ -2,34 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import PrioritizedSampler
+from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 
 from torchrl_mpfa.checks import check_finite
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.storages.storage import SignalStorageMixin
+from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
+from torchrl_mpfa.storages.tensor import SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
+
+REWARD_KEY = ("next", "reward")
+"""Where TorchRL's collectors put the reward."""
 
 
 class CheckedReplayBuffer(TensorDictReplayBuffer):
-    """TorchRL's buffer, whose transitions are checked where its storage keeps signals."""
+    """TorchRL's buffer, whose transitions are checked before any of them is written."""
 
     _memory: TransformMemory
+    _allow_nonfinite: Sequence[NestedKey] = ()
+    _schema: Schema | None = None
+    _clock: list[int]
+    """Count of writes, which the states of the buffer share and see change."""
 
     def _initialize_prioritized_sampler(self) -> None:
         # The last that is done when the parts are made.
         super()._initialize_prioritized_sampler()
-        allowed = getattr(self._storage, "_allow_nonfinite", ())
-        self._memory = TransformMemory(self._transform, allowed)
+        self._memory = TransformMemory(self._transform, self._allow_nonfinite)
 
-    @property
-    def _checks(self) -> bool:
-        return isinstance(self.storage, SignalStorageMixin) and not self._is_consuming()
+    def __getstate__(self) -> Any:
+        # The copy describes its own data.
+        return {**super().__getstate__(), "_schema": None}
+
+    def _checks(self, data: Any) -> bool:
+        # Not the attribute: the property has the parts made, where that was put off to their use.
+        sampler = self.sampler
+        ours = isinstance(sampler, SignalSampler) or isinstance(self._storage, SignalTensorStorage)
+        consumes = isinstance(sampler, ConsumingSampler)
+        return ours and not consumes and isinstance(data, TensorDictBase)
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
@@ -49,7 +65,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 finite, a first priority cannot be, there is no batch size, or padding cannot be
                 left out; nothing is changed, in the transforms neither.
         """
-        if not self._checks or not isinstance(tensordicts, TensorDictBase):
+        if not self._checks(tensordicts):
             return super().extend(tensordicts, update_priority=update_priority)
         if tensordicts.ndim < self._storage.ndim:
             raise ValueError(
@@ -103,7 +119,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         name = f"{self.priority_key!r} of the transitions"
         # Where nothing is sampled by it, a reward may be negative.
         weighs = isinstance(self._sampler, PrioritizedSampler)
-        if not (weighs or self.priority_key != self._storage.signal_table.reward_key):
+        if not weighs and as_path(self.priority_key) == REWARD_KEY:
             return priority
         real = isinstance(priority, Tensor) and not priority.is_complex()
         if weighs and prioritizes and not (real and priority.numel() == shape.numel()):
@@ -121,22 +137,75 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _write(self, data: TensorDictBase) -> Tensor:
         if self.dim_extend > 0:
             data = self._transpose(data)
+        rows = self._check(data)
         writer = self._writer
         in_a_ring = isinstance(writer, RoundRobinWriter)
-        if not in_a_ring:
-            # It may hand on some of them only, and records them before the storage does.
-            self._storage.check(data)
         place = (writer._cursor, writer._write_count) if in_a_ring else None
+        # Another writer may keep some of them only.
+        if in_a_ring and rows is not None and self._storage.ndim == 1:
+            self._sampler.read_next(rows)
         try:
             with torch.no_grad():
                 index: Tensor = writer.extend(data)
         except BaseException:
+            if rows is not None:
+                self._sampler.read_next(None)
             if place is not None:
-                # It moves on before the storage checks what it is to write.
+                # It moves on before the storage has what it is to write.
                 writer._cursor, writer._write_count = place
             raise
+        self._clock[0] += 1
         self._sampler.extend(index)
         return index
+
+    def _check(self, data: TensorDictBase) -> Tensor | None:
+        """Check transitions in the order of their slots; return their rows of the table, if any.
+
+        Raises:
+            KeyError: If an entry is missing or unknown, or one that the sampler reads is missing.
+            ValueError: If shape or dtype of an entry are not those in the storage, or a number is
+                not finite.
+        """
+        lead = min(self._storage.ndim, data.ndim)
+        self._check_width(data)
+        schema = self._stored_schema()
+        if schema is not None:
+            schema.check(data, lead, whole=True)
+        else:
+            check_finite_entries(data, lead, self._allow_nonfinite)
+        if isinstance(self._sampler, SignalSampler):
+            return self._sampler.check_new(data, data.shape[:lead].numel())
+        return None
+
+    def _stored_schema(self) -> Schema | None:
+        """Return the schema of the stored tensordict; None before the first write."""
+        stored = getattr(self._storage, "_storage", None)
+        # What an empty storage was restored from is a tensordict without entries.
+        if not getattr(self._storage, "initialized", False) or not _is_plain(stored):
+            return None
+        if self._schema is None or not self._schema.describes(stored):
+            self._schema = Schema(stored, self._storage.ndim, self._allow_nonfinite)
+        return self._schema
+
+    def _check_width(self, data: TensorDictBase) -> None:
+        """Reject rows of another width than those of a storage of several dimensions."""
+        storage = self._storage
+        if storage.ndim == 1 or data.ndim < storage.ndim:
+            return
+        across = data.shape[1 : storage.ndim]
+        if storage.initialized:
+            expected = storage._total_shape[1:]
+            if across != expected:
+                raise ValueError(
+                    f"transitions must come {[*expected]} at a time, as the first ones did, got "
+                    f"{[*across]}"
+                )
+        elif isinstance(self._sampler, SignalSampler) and storage.max_size % across.numel():
+            # TorchRL rounds up; the sampler that fuses could not.
+            raise ValueError(
+                f"max_size must be a multiple of the {across.numel()} transitions that come at a "
+                f"time, got {storage.max_size}"
+            )
 
     def add(self, data: TensorDictBase) -> Any:
         """Write one transition, and return its slot.
@@ -148,7 +217,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             KeyError: See :meth:`extend`.
             ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
         """
-        if not self._checks:
+        if not self._checks(data):
             return super().add(data)
         if data.ndim < self.dim_extend:
             raise ValueError(
@@ -163,7 +232,14 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         """Write whole transitions in slots, and none of their entries by its key."""
         if isinstance(index, str | tuple):
             self._write_in_place()
+        if self._checks(value):
+            self._check(value if value.ndim else value.unsqueeze(0))
         super().__setitem__(index, value)
+        self._clock[0] += 1
+        # A storage of this package says so itself, whoever writes in it.
+        fuses = isinstance(self._sampler, SignalSampler)
+        if fuses and not isinstance(self._storage, SignalTensorStorage):
+            self.mark_update(slots_of(self._storage, index))
 
     def _write_in_place(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise: signals are read when a transition is written, and would not follow."""
@@ -183,3 +259,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         with self._replay_lock, self._write_lock:
             super().empty(empty_write_count)
         self._memory.empty()
+
+
+def _is_plain(stored: Any) -> bool:
+    """Return True if a storage holds a tensordict with entries."""
+    return isinstance(stored, TensorDict) and len(stored.keys()) > 0

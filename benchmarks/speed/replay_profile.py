@@ -28,7 +28,7 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalTensorStorage,
 )
-from torchrl_mpfa.storages import SignalTable
+from torchrl_mpfa.samplers import SignalTable
 
 Part = tuple[str, Any, str]
 SAMPLE: tuple[Part, ...] = (

@@ -20,6 +20,7 @@ import play
 import recurrent_td3
 import report
 import stable_baselines
+import torchrl_ddpg
 import torchrl_sac
 import torchrl_trainer
 import tune
@@ -53,6 +54,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "recurrent_td3": recurrent_td3.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
+    "torchrl_ddpg": torchrl_ddpg.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
     "tune": tune.main,

@@ -49,7 +49,7 @@ def tiny_trainer(seed: int = 0) -> DDPGTrainer:
 
 def known_and_replayed(trainer: Trainer, *names: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Which slots have these learned signals, and which were in a batch."""
-    table = trainer.replay_buffer.storage.signal_table
+    table = trainer.replay_buffer.sampler.table
     rows = table.rows[: table.size]
     learned = [table.column[name] for name in names or ("td_error", "action_gradient")]
     return rows[:, learned].isfinite().all(1), rows[:, table.count_column] > 0
@@ -106,7 +106,7 @@ def test_two_trainings_of_one_seed_are_the_same_and_of_another_seed_are_not() ->
         trainer = tiny_trainer(seed)
         PriorityStepper().register(trainer)
         trainer.train()
-        tables.append(trainer.replay_buffer.storage.signal_table.rows.nan_to_num(-1))
+        tables.append(trainer.replay_buffer.sampler.table.rows.nan_to_num(-1))
         policies.append(torch.cat([p.flatten() for p in trainer.loss_module.parameters()]))
     assert tables[0].equal(tables[1])
     assert policies[0].equal(policies[1])

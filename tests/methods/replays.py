@@ -19,7 +19,7 @@ def make_transitions(count, *, seed=0):
 
 def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, seed=0):
     """A buffer with this many random transitions."""
-    storage = SignalTensorStorage(capacity, signals=signals or ["td_error"])
+    storage = SignalTensorStorage(capacity)
     buffer = make_any_buffer(capacity, batch_size, storage=storage, sampler=sampler, seed=seed)
     if filled is None:
         filled = capacity

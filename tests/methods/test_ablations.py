@@ -20,7 +20,7 @@ def priorities_of(name):
     """Priorities of the eight transitions, eps included, after one update of all of them."""
     method = replace(METHODS[name], capacity=8, batch_size=4)
     sampler = method.sampler()
-    buffer = make_buffer(sampler, 8, 4, filled=0, signals=method.kept_signals())
+    buffer = make_buffer(sampler, 8, 4, filled=0)
     buffer.extend(TensorDict({"next": {"reward": torch.tensor(REWARDS).unsqueeze(1)}}, [8]))
     set_signals(buffer, td_error=torch.tensor(ERRORS), action_gradient=torch.tensor(SLOPES))
     return sampler.priorities(torch.arange(8)).tolist()

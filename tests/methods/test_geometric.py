@@ -65,7 +65,7 @@ def test_no_share_leads_beyond_the_oldest_transition():
 
 def test_in_two_dimensions_age_goes_along_time_and_the_robots_are_alike():
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(12, signals=["td_error"], ndim=2),
+        storage=SignalTensorStorage(12, ndim=2),
         sampler=GeometricSampler(recency=3.0),
         batch_size=SAMPLES,
         generator=seeded(0),

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from tests.methods.replays import assert_shares, seeded, set_signals
-from torchrl_mpfa import SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.reaper import reliability
 
@@ -214,5 +213,3 @@ def test_missing_entry_or_part_is_named():
         replay.buffer.extend(make_rows([0, 0]).exclude("episode"))
     with pytest.raises(KeyError, match="the transitions lack 'ended'"):
         replay.buffer.extend(make_rows([0, 0]).exclude(("next", "done")))
-    with pytest.raises(ValueError, match=r"signals \['episode', 'ended'\] of the sampler are not"):
-        make_replay("reaper", storage=SignalTensorStorage(10, signals=["td_error"]))

@@ -59,7 +59,7 @@ COMMON = [
     ("_alpha", lambda _: "0.6", "alpha must be a number, got '0.6'"),
     ("_beta", torch.tensor, "'_beta' of the saved sampler must be a plain value"),
     ("_eps", lambda _: -1.0, "eps must be finite and not negative, got -1.0"),
-    ("_format", lambda _: 99, "'_format' of the saved sampler must be 3, got 99"),
+    ("_format", lambda _: 99, "'_format' of the saved sampler must be 4, got 99"),
     ("_max_capacity", lambda _: 10**18, "'_max_capacity' of the saved sampler must be 12, got 10"),
     ("_sum_tree", with_nan, "'_sum_tree' of the saved sampler must be finite and not neg"),
     ("_min_tree", with_nan, "'_min_tree' of the saved sampler must be finite and not neg"),
@@ -145,7 +145,7 @@ def test_replay_of_every_method_is_pickled_and_copied(name, way):
 
 
 def test_replay_with_a_memory_mapped_storage_is_copied():
-    replay = make_replay("per", storage=SignalMemmapStorage(16, signals=["td_error"]), batch_size=4)
+    replay = make_replay("per", storage=SignalMemmapStorage(16), batch_size=4)
     replay.buffer.extend(make_transitions(12))
     again = copy.deepcopy(replay)
     assert batches(replay).equal(batches(again))

@@ -118,7 +118,7 @@ class Reversed(SignalSampler):
 @pytest.mark.parametrize("kind", [SignalSampler, RankPERSampler, Uniform, Deaf, Reversed])
 def test_only_a_sampler_that_works_saves_half_of_the_updates(kind, of_uniform):
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(SIZE, signals=["td_error"]),
+        storage=SignalTensorStorage(SIZE),
         sampler=kind(SIZE, 0.6, 0.4, 1e-3),
         batch_size=4,
         generator=torch.Generator().manual_seed(0),

@@ -1,7 +1,5 @@
 """Adjustments that count the buffer: when they count, what they are told, and what is saved."""
 
-from copy import deepcopy
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -195,13 +193,3 @@ def test_an_adaptive_boost_favors_rare_goals_over_common_ones():
 def test_adjustments_that_count_pass_the_checks():
     check_adjustment(PositiveBoost(target_share=0.5))
     assert METHODS["mpfa_adaptive"].boost_target == 0.5
-
-
-def test_count_of_later_writes_is_made_again():
-    buffer, census = make_counted()
-    state = deepcopy(buffer.storage.state_dict())
-    buffer.extend(make_transitions(6))
-    train(buffer, 1)
-    buffer.storage.load_state_dict(state)
-    train(buffer, 1)
-    assert census.asked == 2

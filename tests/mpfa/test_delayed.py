@@ -74,7 +74,7 @@ def test_any_first_call_makes_the_parts(tmp_path):
     for name, call in first.items():
         buffer = make_delayed()
         call(buffer)
-        assert buffer.storage.needs_signals, name
+        assert buffer.storage.signal_table is buffer.sampler.table, name
     with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
         make_delayed().sample()
     with pytest.raises(IndexError, match=r"index must be in \[0, 0\)"):

@@ -5,19 +5,23 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 
 from tests.mpfa.transitions import (
+    make_buffer,
     make_filled,
     make_transitions,
     rejected,
     same,
     seeded,
+    snapshot,
     train_rounds,
     write_signals,
 )
 from torchrl_mpfa import (
     MPFASampler,
+    SignalReplayBuffer,
+    SignalSliceSampler,
     SignalTensorStorage,
 )
 from torchrl_mpfa.samplers import TreeSampler
@@ -37,15 +41,60 @@ def test_a_buffer_of_torchrl_causes_one_warning(key):
     assert len(seen) == 1
 
 
-def test_a_storage_of_torchrl_causes_one_warning():
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(16), sampler=MPFASampler(16), batch_size=4
+@pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized:UserWarning")
+@pytest.mark.parametrize("kind", [LazyTensorStorage, LazyMemmapStorage])
+@pytest.mark.parametrize("write", ["extend", "add", "in place"])
+def test_a_storage_of_torchrl_gives_the_same_batches_and_priorities(kind, write):
+    ours, theirs = make_filled(16), make_filled(16, storage=kind(16))
+    for buffer in (ours, theirs):
+        new = make_transitions(3, seed=7, first=50)
+        if write == "extend":
+            buffer.extend(new)
+        elif write == "add":
+            buffer.add(new[0])
+        else:
+            buffer[torch.tensor([5, 2, 9])] = new
+    assert train_rounds(ours, 4).equal(train_rounds(theirs, 4))
+    assert same(ours.sampler.state_dict(), theirs.sampler.state_dict())
+    again = make_buffer(16, storage=kind(16), seed=3)
+    again.load_state_dict(snapshot(theirs))
+    assert train_rounds(ours, 2).equal(train_rounds(again, 2))
+
+
+def test_trajectories_in_a_list_of_torchrl_s_stay_whole():
+    trajectories = TensorDict({"observation": torch.rand(3, 4, 5)}, [3, 4])
+    buffer = SignalReplayBuffer(sampler=TreeSampler(5, 0.7, 0.9), batch_size=3)
+    buffer.extend(trajectories)
+    assert len(buffer) == 3
+    assert buffer.sample()["observation"].shape == (3, 4, 5)
+
+
+@pytest.mark.parametrize("storage", [SignalTensorStorage, LazyTensorStorage])
+def test_sampler_without_a_capacity_takes_that_of_the_storage(storage):
+    given, taken = (
+        make_filled(16, storage=storage(16), sampler=MPFASampler(n)) for n in (16, None)
     )
-    buffer.extend(make_transitions(16))
-    with pytest.warns(UserWarning, match="LazyTensorStorage, which keeps no signals") as seen:
-        for _ in range(3):
-            buffer.sample()
-    assert len(seen) == 1
+    assert taken.sampler.max_size == taken.sampler.table.capacity == 16
+    assert train_rounds(given, 3).equal(train_rounds(taken, 3))
+    assert same(given.sampler.state_dict(), taken.sampler.state_dict())
+    with pytest.raises(ValueError, match=r"max_capacity of the sampler is 16, max_size .* 8"):
+        make_buffer(8, storage=storage(8), sampler=taken.sampler)
+
+
+def test_slices_longer_than_the_capacity_of_the_storage_are_rejected():
+    sampler = SignalSliceSampler(None, 0.6, 0.4, slice_len=9)
+    with pytest.raises(ValueError, match="slice_len must be at most max_capacity, 8, got 9"):
+        make_buffer(8, 9, storage=SignalTensorStorage(8), sampler=sampler)
+
+
+def test_signals_follow_each_write_of_two_buffers_that_share_a_storage():
+    storage = SignalTensorStorage(16)
+    first, second = make_buffer(16, storage=storage), make_buffer(16, storage=storage)
+    first.extend(make_transitions(16))
+    second.extend(make_transitions(3, seed=4))
+    expected = storage[:]["next", "reward"].squeeze(1)
+    for buffer in (first, second):
+        assert buffer.sampler.table.rewards.float().equal(expected)
 
 
 def test_a_buffer_and_storage_of_ours_need_no_warning():

@@ -15,7 +15,7 @@ from torchrl_mpfa.fusion import (
     positive_entropy,
     reward_entropy,
 )
-from torchrl_mpfa.storages import SignalTable
+from torchrl_mpfa.samplers import SignalTable
 
 NAMES = ["td_error", "action_gradient", "reward"]
 

@@ -28,7 +28,6 @@ from torchrl_mpfa import (
     ActorCriticLearner,
     DQNLearner,
     SignalDQNLoss,
-    SignalTensorStorage,
     TabularQLearner,
     make_actor,
     make_critic,
@@ -293,10 +292,9 @@ def test_learner_of_another_loss_or_a_copy_is_rejected(make, words):
         make()
 
 
-def test_sampler_of_reliability_rejects_a_storage_without_episodes():
-    storage = SignalTensorStorage(10, signals=["td_error"])
-    with pytest.raises(ValueError, match=r"must keep the signals \['episode', 'ended'\], got"):
-        ReaPERSampler(10, 0.3, 0.4).bind(storage)
+def test_sampler_of_reliability_rejects_signals_without_the_td_error():
+    with pytest.raises(ValueError, match=r"signals must have 'td_error', got \['reward'\]"):
+        ReaPERSampler(10, 0.3, 0.4, signals=["reward"])
 
 
 @pytest.mark.parametrize("kind", KINDS)

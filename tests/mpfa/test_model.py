@@ -194,9 +194,8 @@ class Replay(RuleBasedStateMachine):
     @rule(
         path=st.sampled_from(
             [
-                ("_storage", "_len"),
-                ("_storage", "_signals", "rows"),
-                ("_storage", "_signals", "size"),
+                ("_sampler", "_signals", "rows"),
+                ("_sampler", "_signals", "size"),
                 ("_sampler", "_eps"),
                 ("_sampler", "_sum_tree"),
                 ("_writer", "_cursor"),

@@ -6,7 +6,7 @@ from tests.mpfa.transitions import make_filled, train_rounds
 from torchrl_mpfa import FixedFusion, Fusion, ScaledFusion
 from torchrl_mpfa.fusion import Annealed
 from torchrl_mpfa.methods.hvper import ScheduledFusion
-from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.samplers.table import SignalTable
 
 NAMES = ["td_error", "reward"]
 

@@ -119,8 +119,8 @@ def test_an_update_of_nothing_is_nothing():
     after = buffer.state_dict()
     del after["_rng"]
     counts = buffer.storage.signal_table.count_column
-    before["_storage"]["_signals"]["rows"][:, counts] = 0
-    after["_storage"]["_signals"]["rows"][:, counts] = 0
+    before["_sampler"]["_signals"]["rows"][:, counts] = 0
+    after["_sampler"]["_signals"]["rows"][:, counts] = 0
     assert same(before, after)
 
 
@@ -128,8 +128,10 @@ def test_signals_are_read_under_nested_and_renamed_keys():
     slope = Signal("slope", key=("agent", "critic", "slope"))
     reward = Signal("reward", key=("next", "agent", "r"), known_at="write")
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(8, signals=[slope, reward], reward_key=reward.key),
-        sampler=MPFASampler(8, signals=[slope, reward], adjustments=[], eps=0.0),
+        storage=SignalTensorStorage(8),
+        sampler=MPFASampler(
+            8, reward_key=reward.key, signals=[slope, reward], adjustments=[], eps=0.0
+        ),
         batch_size=4,
     )
     rewards = torch.tensor([1.0, -3.0])

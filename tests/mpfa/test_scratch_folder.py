@@ -24,16 +24,18 @@ def test_folder_in_use_is_rejected_and_its_user_unaffected(tmp_path, capacity):
 
 def test_files_of_an_earlier_storage_are_overwritten_only_if_asked(tmp_path):
     storage = SignalMemmapStorage(16, scratch_dir=tmp_path)
-    storage.set(torch.arange(3), make_transitions(3))
+    buffer = make_buffer(16, storage=storage)
+    buffer.extend(make_transitions(3))
     size = os.stat(tmp_path / "signals.memmap").st_size
-    del storage
+    del storage, buffer
     gc.collect()
     with pytest.raises(FileExistsError, match="is there from an earlier storage: pass existsok=Tr"):
         SignalMemmapStorage(8, scratch_dir=tmp_path)
     assert os.stat(tmp_path / "signals.memmap").st_size == size
     storage = SignalMemmapStorage(8, scratch_dir=tmp_path, existsok=True)
+    buffer = make_buffer(8, storage=storage)
     assert storage.signal_table.size == 0
-    storage.set(torch.arange(3), make_transitions(3))
+    buffer.extend(make_transitions(3))
     assert os.stat(tmp_path / "signals.memmap").st_size == size // 2
 
 

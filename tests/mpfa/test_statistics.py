@@ -118,7 +118,7 @@ def test_a_fusion_without_entropies_has_none_in_the_statistics():
 
 def test_every_entry_is_a_plain_finite_number(trained):
     buffer, _ = trained
-    for name, value in buffer.sampler.stats(buffer.storage).items():
+    for name, value in buffer.sampler.stats().items():
         assert type(value) is float, name
         assert math.isfinite(value), name
 

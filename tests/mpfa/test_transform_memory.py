@@ -182,22 +182,43 @@ def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers(own):
         assert torch.equal(*states)
 
 
-@pytest.mark.parametrize("kind", TRANSFORMS)
-@pytest.mark.parametrize("way", ["state", "folder", "pickle", "copy"])
-def test_waiting_steps_are_saved_and_written_after_a_load(kind, way, tmp_path):
+def loaded_again(kind, way, folder):
+    """A buffer in whose transform steps wait, and another one that was loaded from it."""
     buffer, again = make(kind), make(kind)
     again.extend(steps(40, 5))  # A load replaces what waits.
     for each in writes()[:2]:
         buffer.extend(each)
     if way in ("state", "folder"):
-        restore(again, buffer, tmp_path / "replay" if way == "folder" else None)
+        restore(again, buffer, folder / "replay" if way == "folder" else None)
     else:
         again = pickle.loads(pickle.dumps(buffer)) if way == "pickle" else copy.deepcopy(buffer)
     for each in (buffer, again):
         each.extend(writes()[2])
         each.extend(steps(11, 7))
+    return buffer, again
+
+
+SAVED = [(kind, way) for kind in ("hindsight", "extra state") for way in ("state", "folder")]
+COPIED = [(kind, way) for kind in TRANSFORMS for way in ("pickle", "copy")]
+
+
+@pytest.mark.parametrize(("kind", "way"), SAVED + COPIED)
+def test_waiting_steps_are_saved_and_written_after_a_load(kind, way, tmp_path):
+    buffer, again = loaded_again(kind, way, tmp_path)
     assert same(held(buffer), held(again))
     assert len(buffer) > 10
+
+
+@pytest.mark.parametrize("kind", ["n-step", "n-step within", "list", "window", "mapping"])
+@pytest.mark.parametrize("way", ["state", "folder"])
+def test_waiting_steps_that_are_not_saved_are_lost_and_no_row_is_wrong(kind, way, tmp_path):
+    buffer, again = loaded_again(kind, way, tmp_path)
+    ends = "observation", ("next", "observation")
+    rows, found = (
+        set(map(tuple, torch.cat([b[:][key] for key in ends], 1).tolist())) for b in (buffer, again)
+    )
+    assert found < rows
+    assert sorted(first for first, _ in rows - found) == [2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
@@ -226,16 +247,14 @@ def test_waiting_steps_share_no_tensors_with_the_caller(kind):
     assert torch.equal(buffer[:]["observation"], other[:]["observation"])
 
 
-@pytest.mark.parametrize(
-    "kept",
-    [3, {"7.": {"rows": 1}}, {"0.": {"no_such": 1}}, {"0.": 3}],
-    ids=["number", "part", "name", "3"],
-)
-def test_state_of_other_transforms_is_rejected_and_changes_nothing(kept):
-    buffer = make("n-step")
-    buffer.extend(steps(0, 8))
-    state = {**snapshot(buffer), "_kept": kept}
-    with rejected(buffer, ValueError, "'_kept' of the saved buffer must be of transforms"):
+@pytest.mark.parametrize("wrong", [3, {"reward": torch.full((2,), torch.nan)}])
+def test_wrong_state_of_unfinished_episodes_is_rejected_and_changes_nothing(wrong):
+    buffer = make("hindsight")
+    buffer.extend(steps(0, 4))
+    state = snapshot(buffer)
+    (name,) = [name for name in state["_transforms"] if name.endswith("_extra_state")]
+    state["_transforms"][name] = wrong
+    with rejected(buffer, ValueError, "the saved unfinished episodes must be"):
         buffer.load_state_dict(state)
 
 

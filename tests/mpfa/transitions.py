@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mpfa import MPFA_SIGNALS, MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 
 
 def seeded(seed=0):
@@ -30,7 +30,7 @@ def make_transitions(count, *, seed=0, first=0, rewards=None):
     )
 
 
-_OF_BUFFER = {"transform", "transform_factory", "writer", "priority_key"}
+_OF_BUFFER = {"transform", "transform_factory", "writer", "priority_key", "allow_nonfinite"}
 
 
 def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, sampler=None, **kwargs):
@@ -39,8 +39,7 @@ def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, sampler=None
     if sampler is None:
         sampler = MPFASampler(capacity, **kwargs)
     if storage is None:
-        signals = getattr(sampler, "signals", MPFA_SIGNALS)
-        storage = SignalTensorStorage(capacity, signals=signals)
+        storage = SignalTensorStorage(capacity)
     return SignalReplayBuffer(
         storage=storage, sampler=sampler, batch_size=batch_size, generator=seeded(seed), **parts
     )

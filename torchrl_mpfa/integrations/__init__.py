@@ -1,4 +1,4 @@
-"""Parts for TorchRL's trainers, for Hydra and for Ray, each imported by its own module alone."""
+"""Parts for TorchRL's trainers and for Ray, each imported by its own module alone."""
 
 from typing import Any
 

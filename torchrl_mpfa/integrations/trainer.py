@@ -15,13 +15,18 @@ from torchrl.trainers import (
     Trainer,
 )
 
+from torchrl_mpfa.losses.torchrl import SUPPORTED, write_signals
+from torchrl_mpfa.signals import TD_ERROR
+
 
 class PriorityStepper(OptimizationStepper):
     """An optimization stepper that updates the priorities of each batch after its step.
 
     Another stepper takes the step itself, by default TorchRL's: all losses in one backward pass,
     one step of the trainer's optimizer. Target networks stay with the trainer. The loss writes the
-    signals in the batch, and ``replay_buffer.update_tensordict_priority`` reads them.
+    signals in the batch, and ``replay_buffer.update_tensordict_priority`` reads them. For a loss of
+    TorchRL's own, :func:`~torchrl_mpfa.write_signals` does, with the slope of the critic after the
+    step.
 
     Args:
         stepper: Stepper that takes the step; by default
@@ -72,6 +77,8 @@ class PriorityStepper(OptimizationStepper):
         """
         replay_buffer = buffer_of(trainer)
         metrics = self.stepper.step(trainer, sub_batch)
+        if sub_batch.get(TD_ERROR.key, None) is None and isinstance(trainer.loss_module, SUPPORTED):
+            write_signals(sub_batch, trainer.loss_module)
         replay_buffer.update_tensordict_priority(sub_batch)
         self.priority_updates += 1
         # TorchRL's default stepper leaves the graph of its losses in them, and the trainer keeps

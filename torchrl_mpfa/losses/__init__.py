@@ -6,6 +6,7 @@ from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target
 from torchrl_mpfa.losses.sac import SignalSACLoss, make_sac_loss
 from torchrl_mpfa.losses.td3 import SignalTD3Loss, make_td3_loss
+from torchrl_mpfa.losses.torchrl import write_signals
 
 __all__ = [
     "SignalDDPGLoss",
@@ -17,4 +18,5 @@ __all__ = [
     "make_ddpg_loss",
     "make_sac_loss",
     "make_td3_loss",
+    "write_signals",
 ]

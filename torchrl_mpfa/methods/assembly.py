@@ -15,8 +15,6 @@ from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.methods.base import Method
 from torchrl_mpfa.methods.catalogue import method_named
 from torchrl_mpfa.selection import Selection
-from torchrl_mpfa.signals import MPFA_SIGNALS
-from torchrl_mpfa.storages.table import signal_table_of
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 
@@ -122,11 +120,8 @@ def buffer_parts(
     method: Method, *, storage: Storage | None = None, device: torch.device | str = "auto"
 ) -> dict[str, Any]:
     """Return storage, sampler and batch size of a method, as arguments of a buffer."""
-    kept = method.kept_signals()
     if storage is None:
-        storage = SignalTensorStorage(method.capacity, signals=kept or MPFA_SIGNALS, device=device)
-    elif len(kept) > len(method.priority_signals()):
-        signal_table_of(storage, kept, method.capacity)
+        storage = SignalTensorStorage(method.capacity, device=device)
     return {"storage": storage, "sampler": method.sampler(), "batch_size": method.rows}
 
 

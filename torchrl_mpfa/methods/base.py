@@ -118,10 +118,6 @@ class Method:
         """Return the signals of the priority."""
         return []
 
-    def kept_signals(self) -> list[Signal]:
-        """Return the signals that the storage keeps."""
-        return self.priority_signals()
-
     def sampler_options(self) -> dict[str, Any]:
         """Return the arguments of the sampler's class, beyond those of all prioritized ones."""
         return {}

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from torchrl_mpfa.adjustment import Adjustment
     from torchrl_mpfa.fusion import Fusion
     from torchrl_mpfa.selection import Selection
-    from torchrl_mpfa.signals import Signal
 
 
 @dataclass
@@ -100,12 +99,6 @@ class ReaPER(Prioritized):
     def entries(self) -> tuple[str, ...]:
         """The number of the episode."""
         return ("episode",)
-
-    def kept_signals(self) -> list[Signal]:
-        """Return the signals of the priority, and which episode a transition is of."""
-        from torchrl_mpfa.methods.reaper import ENDED, EPISODE
-
-        return [*self.priority_signals(), EPISODE, ENDED]
 
     def sampler_options(self) -> dict[str, Any]:
         """Return the power of the reliability."""

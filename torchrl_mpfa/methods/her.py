@@ -8,13 +8,14 @@ from __future__ import annotations
 from typing import Protocol, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
 from torchrl_mpfa.checks import as_mask, check_counts
 from torchrl_mpfa.episodes import episodes_of
+from torchrl_mpfa.saving import check_saved, check_saved_numbers
 
 
 class Relabel(Protocol):
@@ -120,6 +121,24 @@ class HindsightGoals(Transform):
         self._relabel, self._episode_key = relabel, episode_key
         # Never written in place, and for that reason a tuple.
         self._pending: tuple[TensorDictBase, ...] = ()
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the steps of unfinished episodes, as part of the state of the buffer."""
+        if not self._pending:
+            return {}
+        return dict(cast(TensorDictBase, torch.cat(self._pending)).items(True, True))
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Restore the steps of unfinished episodes.
+
+        Raises:
+            ValueError: If the state is no mapping, or a number is not finite.
+        """
+        check_saved("unfinished episodes", state)
+        check_saved_numbers("unfinished episodes", state)
+        steps = {key: value.clone() for key, value in state.items()}
+        count = len(next(iter(steps.values()))) if steps else 0
+        self._pending = (TensorDict(steps, [count]),) if steps else ()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leave a sampled batch as it is."""

@@ -26,7 +26,7 @@ from torchrl_mpfa.fusion import FixedFusion
 from torchrl_mpfa.signals import Signal
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.storages.table import SignalTable
+    from torchrl_mpfa.samplers.table import SignalTable
 
 
 def relative_value(value: Tensor) -> Tensor:

@@ -63,8 +63,7 @@ class MWSampler(SignalSampler):
         super()._write(slots, priority, learned=learned)
 
     def _set(self, slots: Tensor, priority: Tensor, highest: float) -> None:
-        if self._table is not None:
-            self._spent[slots] = self._table.replay_counts(slots) >= self.replay_cap
+        self._spent[slots] = self.table.replay_counts(slots) >= self.replay_cap
         super()._set(slots, priority, highest)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:

@@ -20,16 +20,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import POSITIVE, check
+from torchrl_mpfa.checks import POSITIVE, as_mask, check
 from torchrl_mpfa.episodes import episodes_of
 from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.samplers.trees import as_slots
 from torchrl_mpfa.signals import TD_ERROR, Signal
-from torchrl_mpfa.storages.table import SignalTable
 
 EPISODE = Signal("episode", key="episode", known_at="write")
 """The number of the episode that a transition is of, which the storage has to keep.
@@ -106,12 +105,15 @@ class ReaPERSampler(SignalSampler):
     """
 
     KIND = "reaper"
+    KEPT = (EPISODE, ENDED)
     _steps: Any = None
     """The storage that is sampled from."""
 
     def __init__(self, *args: Any, exponent: float = 0.3, **kwargs: Any) -> None:
         self.exponent: float = check(POSITIVE, exponent=exponent)
         super().__init__(*args, **kwargs)
+        if TD_ERROR not in self.signals:
+            raise ValueError(f"signals must have {TD_ERROR.name!r}, got {self._names}")
 
     def _init(self) -> None:
         super()._init()
@@ -120,10 +122,11 @@ class ReaPERSampler(SignalSampler):
         self._last_number = self._numbered = 0
         self._open = torch.empty(0, dtype=torch.long)
 
-    @property
-    def mask_keys(self) -> list[NestedKey]:
-        """See :attr:`SignalSampler.mask_keys`."""
-        return [ENDED.key]
+    def check_new(self, data: Any, count: int) -> Tensor:
+        """See :meth:`SignalSampler.check_new`; the mark of an end must be a boolean."""
+        if (ended := data.get(ENDED.key, None)) is not None:
+            as_mask(repr(ENDED.key), ended)
+        return super().check_new(data, count)
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give fresh transitions the highest priority, and rely on episodes that they end.
@@ -131,11 +134,14 @@ class ReaPERSampler(SignalSampler):
         As :meth:`TreeSampler.mark_update`.
         """
         super().mark_update(index, storage=storage)
-        if hasattr(storage, "signal_table"):
-            table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
-            last = table.rows[slots, table.column[ENDED.name]] > 0
-            if last.any():
-                self._rely(table, slots[last])
+        if storage is None:
+            return
+        self._steps = storage
+        table, slots = self.table, as_slots(index, storage).to(self.device)
+        slots = slots[slots >= 0]
+        last = table.rows[slots, table.column[ENDED.name]] > 0
+        if last.any():
+            self._rely(table, slots[last])
 
     def update_signals(
         self,
@@ -153,25 +159,10 @@ class ReaPERSampler(SignalSampler):
         stale = super().update_signals(
             index, signals, storage=storage, written_at=written_at, batches=batches
         )
-        table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
-        self._rely(table, slots[slots < table.size])
-        return stale
-
-    def bind(self, storage: Storage) -> SignalTable:
-        """Take the signals of a storage, as :meth:`SignalSampler.bind`.
-
-        Raises:
-            ValueError: If it does not keep :data:`EPISODE`, :data:`ENDED` and the TD error.
-        """
-        before = self._table
-        table = super().bind(storage)
         self._steps = storage
-        if table is not before:
-            self._numbered = 0
-        kept = (EPISODE.name, ENDED.name, TD_ERROR.name)
-        if absent := [name for name in kept if name not in table.column]:
-            raise ValueError(f"the storage must keep the signals {absent}, got {table.names}")
-        return table
+        slots = as_slots(index, storage).to(self.device)
+        self._rely(self.table, slots[slots < self.table.size])
+        return stale
 
     def _number(self, table: SignalTable) -> None:
         """Number the episodes of the rows that were written since this was last done."""
@@ -222,8 +213,8 @@ class ReaPERSampler(SignalSampler):
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         super()._retransform_priority_trees(old_alpha, new_alpha)
-        if self._table is not None and self._table.size:
-            self._rely(self._table, torch.arange(self._table.size, device=self.device))
+        if self.table.size:
+            self._rely(self.table, torch.arange(self.table.size, device=self.device))
 
 
 def _numbers(episode: Tensor) -> Tensor:

@@ -7,8 +7,9 @@ from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.mpfa import MPFASampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.slices import SignalSliceSampler
+from torchrl_mpfa.samplers.table import SignalTable
 
-__all__ = ["MPFASampler", "SignalSampler", "SignalSliceSampler", "TreeSampler"]
+__all__ = ["MPFASampler", "SignalSampler", "SignalSliceSampler", "SignalTable", "TreeSampler"]
 
 
 def __getattr__(name: str) -> Any:

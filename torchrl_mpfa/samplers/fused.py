@@ -21,15 +21,21 @@ from torchrl_mpfa.adjustment import (
     level_of,
     one_sided,
 )
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite, unknown
+from torchrl_mpfa.checks import (
+    NOT_NEGATIVE,
+    check,
+    check_counts,
+    check_finite,
+    check_index,
+    unknown,
+)
 from torchrl_mpfa.fusion import Annealed, FixedFusion, Fusion, checked_weights, fuse
 from torchrl_mpfa.samplers.prioritized import TreeSampler
-from torchrl_mpfa.samplers.trees import as_slots, in_dimensions_of, last_of_each
+from torchrl_mpfa.samplers.table import SignalTable, by_batch
+from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
-from torchrl_mpfa.storages.table import Columns, SignalTable, by_batch, signal_table_of
 
-_USE = "Use SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
 _COUNT_REFRESH = 1 / 16
@@ -51,9 +57,10 @@ class Weighing:
 class SignalSampler(TreeSampler):
     r"""Prioritized sampling by a priority that is fused from several signals.
 
-    The signals of a slot lie in the storage (:class:`~torchrl_mpfa.SignalTensorStorage`). After
-    each training step :meth:`update_signals` stores the new ones of the batch, fuses them (Eq. 21),
-    adjusts the result (Eqs. 22-24) and writes it to the segment tree that Eq. (8) samples from::
+    The sampler keeps the signals of every slot in :attr:`table`. A write of a slot resets them:
+    those that are known at the write are read from the storage, whatever it is. After each training
+    step :meth:`update_signals` stores the new ones of the batch, fuses them (Eq. 21), adjusts the
+    result (Eqs. 22-24) and writes it to the segment tree that Eq. (8) samples from::
 
         signals [B, K] --fusion--> p_i [B] --adjustments--> p'_i [B] --alpha--> tree
 
@@ -73,6 +80,7 @@ class SignalSampler(TreeSampler):
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, for any capacity.
+        reward_key: Where the signed reward of a transition is read.
         **kwargs: Further arguments.
 
     Raises:
@@ -86,6 +94,8 @@ class SignalSampler(TreeSampler):
     """
 
     KIND = "signals"
+    KEPT: tuple[Signal, ...] = ()
+    """Further entries of transitions that the table keeps."""
 
     def __init__(
         self,
@@ -94,6 +104,7 @@ class SignalSampler(TreeSampler):
         fusion: Fusion | None = None,
         adjustments: Sequence[Adjustment] = (),
         entropy_refresh: float = 1 / 256,
+        reward_key: NestedKey = ("next", "reward"),
         **kwargs: Any,
     ) -> None:
         self.signals = as_signals(signals)
@@ -110,12 +121,23 @@ class SignalSampler(TreeSampler):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
         self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self._counting = [counts_buffer(each) for each in self.adjustments]
-        self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
-        self._names = [s.name for s in self.signals]
-        self._columns: Columns = slice(0)
-        self._table: SignalTable | None = None
+        self.reward_key = reward_key
         self._warned: set[str] = set()
+        self._read: Tensor | None = None
+        self._attached = False
         super().__init__(*args, **kwargs)
+        self.table = self._empty_table()
+        """Signals, reward, replay count and time of writing of every slot."""
+        self._names = self.table.names[self.table.fused]
+
+    def _empty_table(self) -> SignalTable:
+        return SignalTable(
+            self._max_capacity,
+            self.signals,
+            kept=[signal for signal in self.KEPT if signal not in self.signals],
+            reward_key=self.reward_key,
+            device=self.device,
+        )
 
     def _init(self) -> None:
         super()._init()
@@ -134,15 +156,63 @@ class SignalSampler(TreeSampler):
         if isinstance(self.fusion, Annealed):
             self.fusion.anneal(fraction)
 
-    @property
-    def needed_keys(self) -> list[NestedKey]:
-        """Entries that transitions must have in addition to reward and signals."""
-        return []
+    def _resize(self, capacity: int) -> None:
+        super()._resize(capacity)
+        self.table = self._empty_table()
 
-    @property
-    def mask_keys(self) -> list[NestedKey]:
-        """Entries of transitions that are read as booleans."""
-        return []
+    def _empty(self) -> None:
+        super()._empty()
+        self.table.clear()
+
+    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
+        super()._maybe_init_from_storage(storage)
+        # A storage of this package has room for them, in its files if it has some.
+        if getattr(storage, "signal_table", self.table) is None:
+            storage.hold(self.table)  # type: ignore[union-attr]
+
+    def attach(self, storage: Storage) -> SignalTable:
+        """Use the storage of a buffer that hands signals on; return the table of the signals."""
+        self._maybe_init_from_storage(storage)
+        self._attached = True
+        return self.table
+
+    def check_new(self, data: Any, count: int) -> Tensor:
+        """Check transitions that are about to be written; nothing is changed.
+
+        Returns:
+            Their rows of the table, shape ``[count, K + 3]``.
+
+        Raises:
+            KeyError: If a reward or signal that is known at the write is missing.
+            ValueError: If one is no finite number for each transition, or a signal is negative.
+        """
+        rows = self.table.read(data, count)
+        if (name := self.table.missing(rows)) is not None:
+            keys = {signal.name: signal.key for signal in self.table.written}
+            key = keys.get(name, self.reward_key)
+            raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
+        return rows
+
+    def read_next(self, rows: Tensor | None) -> None:
+        """Take rows of :meth:`check_new` for the slots that are marked next; None: read them."""
+        self._read = rows
+
+    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
+        """Read the signals of new transitions in a storage, and give them the highest priority."""
+        self._maybe_init_from_storage(storage)
+        slots = check_index(as_slots(index, storage), self._max_capacity)
+        if len(slots):
+            if storage is not None:
+                self._record(slots, storage)
+            super().mark_update(slots)
+
+    def _record(self, slots: Tensor, storage: Storage) -> None:
+        """Read the signals of new transitions."""
+        rows, self._read = self._read, None
+        if rows is None:
+            rows = self.table.read(Steps(storage, slots), len(slots))
+        self.table.write(slots, rows)
+        self.table.size = len(storage)
 
     def check_batch_size(self, batch_size: int) -> None:
         """Reject a batch size that cannot be sampled."""
@@ -156,15 +226,8 @@ class SignalSampler(TreeSampler):
         slots, weight = self._sampled(storage, batch_size)
         info: dict[Any, Tensor] = {"priority_weight": weight}
         self._last_batch = (slots, weight)
-        table = getattr(storage, "signal_table", None)
-        if table is not None:
-            table.count_replay(slots)
-            info["written_at"] = table.written_at(slots)
-        else:
-            self._warn_once(
-                f"{type(self).__name__} samples from a {type(storage).__name__}, which keeps no "
-                f"signals: nothing can be fused. {_USE}"
-            )
+        self.table.count_replay(slots)
+        info["written_at"] = self.table.written_at(slots)
         return in_dimensions_of(storage, slots), info
 
     def update_priority(
@@ -172,10 +235,11 @@ class SignalSampler(TreeSampler):
     ) -> None:
         """Set priorities directly, see :meth:`TreeSampler.update_priority`."""
         # TorchRL's buffers hand a first priority to transitions that they find in a storage.
-        if self._table is None and self._highest is not None:
+        if not self._attached and self._highest is not None:
             self._warn_once(
                 f"{type(self).__name__} was given one number as the priority: it is neither fused "
-                f"nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. {_USE}"
+                "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. Use "
+                "SignalReplayBuffer"
             )
         super().update_priority(index, priority, storage=storage)
 
@@ -199,7 +263,7 @@ class SignalSampler(TreeSampler):
             index: Slots, shape ``[B]``, or places in a storage of ``D`` dimensions, shape
                 ``[B, D]``. Of a slot that appears twice, the last entry counts.
             signals: The learned signals by name, each of shape ``[B]`` or ``[B, 1]``.
-            storage: The storage with the signal table.
+            storage: The storage of the transitions.
             written_at: The entry of that name in the sampled batch, shape ``[B]``: rows whose
                 slot was written since are left out.
             batches: Number of batches of one size in these slots, one after the other; each is
@@ -213,17 +277,17 @@ class SignalSampler(TreeSampler):
             IndexError: If a slot was never filled or, without ``written_at``, is not filled now.
             ValueError: If a signal or ``written_at`` has the wrong shape, a signal is negative or
                 not finite, or the slots are not so many equal batches.
-            TypeError: If the storage keeps no signals, or the index holds anything but integers.
+            TypeError: If the index holds anything but integers.
         """
-        table = self.bind(storage)
+        table = self.attach(storage)
         slots = as_slots(index, storage).to(table.device)
         if slots.numel() == 0:
             return 0
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
         stale = 0 if live is None else len(live) - len(slots)
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
-        table.fill_learned(rows, signals, self._learned, live, sizes)
-        table.check_fused(rows, self._names, self._columns)
+        table.fill_learned(rows, signals, live, sizes)
+        table.check_fused(rows)
         if slots.numel() == 0:
             return stale
         weighing, adjusted, at_once = self._weighing, [], 1
@@ -280,7 +344,7 @@ class SignalSampler(TreeSampler):
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""
-        return fuse(rows[:, self._columns], weighing.weights, eps=self._eps)
+        return fuse(rows[:, self.table.fused], weighing.weights, eps=self._eps)
 
     def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
         """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
@@ -319,28 +383,9 @@ class SignalSampler(TreeSampler):
             last, counted=tuple(counted), counted_writes=table.writes, learned_since=learned
         )
 
-    def bind(self, storage: Storage) -> SignalTable:
-        """Fuse the signals of this storage, which must be those of the sampler."""
-        self._maybe_init_from_storage(storage)
-        known: SignalTable | None = getattr(storage, "signal_table", None)
-        if known is not None and known is self._table:
-            return known
-        table = signal_table_of(storage, self.signals, self._max_capacity)
-        weights, before = self.weights, self._weighing
-        self._names = sorted((s.name for s in self.signals), key=table.column.__getitem__)
-        places = [table.column[name] for name in self._names]
-        # Neighbouring columns are read as a view, which is much faster than by a list.
-        neighbours = places == list(range(places[0], places[0] + len(places)))
-        others = torch.tensor(places).to(self.device)
-        self._columns = slice(places[0], places[-1] + 1) if neighbours else others
-        if before is not None:
-            self._weighing = replace(before, weights=self._ordered(weights))
-        self._table = table
-        return table
-
-    def stats(self, storage: Storage) -> dict[str, float]:
+    def stats(self) -> dict[str, float]:
         """Return the composition of buffer and last batch by name, see ``docs/metrics.md``."""
-        table, weights = self.bind(storage), self.weights
+        table, weights = self.table, self.weights
         found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
         for place, adjust in enumerate(self.adjustments):
             if isinstance(adjust, PositiveBoost):
@@ -359,7 +404,7 @@ class SignalSampler(TreeSampler):
         if (entropies := getattr(self.fusion, "entropies", None)) is not None:
             values = entropies(self._names, table, index).tolist()
             found |= {f"entropy/{n}": v for n, v in zip(self._names, values, strict=True)}
-        known = rows[:, self._columns]
+        known = rows[:, table.fused]
         known = known[~known.isnan().any(1)]
         if weights and len(known):
             # Shares in the mean priority of Eq. (21); equal ones if every signal is zero.
@@ -384,7 +429,7 @@ class SignalSampler(TreeSampler):
         last = self._weighing or Weighing()
         state = {
             **super().state_dict(),
-            "_signals": sorted(self._names),
+            "_signals": self.table.state_dict(),
             "_weights": self.weights,
             "_weighed_at": last.writes,
             "_mean_reward": last.mean_reward,
@@ -397,8 +442,9 @@ class SignalSampler(TreeSampler):
 
     def _restore(self, state: dict[str, Any]) -> None:
         names = sorted(self._names)
-        check_saved("sampler", state, ("_weights", "_weighed_at", "_mean_reward"), _signals=names)
+        check_saved("sampler", state, ("_signals", "_weights", "_weighed_at", "_mean_reward"))
         super()._restore(state)
+        self.table = self.table.restored(state["_signals"], self._max_capacity, self.device)
         counted = []
         if any(self._counting):
             check_saved("sampler", state, ("_counted", "_counted_writes", "_learned_since"))
@@ -426,6 +472,13 @@ class SignalSampler(TreeSampler):
             tuple(v if v is None else v.to(self.device) for v in counted),
             *(state.get(name, 0) for name in ("_counted_writes", "_learned_since")),
         )
+
+    def _take(self, twin: Any) -> None:
+        table = self.table
+        super()._take(twin)
+        # The storage holds this one.
+        table.take(self.table)
+        self.table = table
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:
         ordered = torch.tensor([weights[name] for name in self._names], dtype=torch.double)

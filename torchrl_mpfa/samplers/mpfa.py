@@ -20,7 +20,7 @@ class MPFASampler(SignalSampler):
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
 
     Args:
-        max_capacity: Capacity of the storage ``N``.
+        max_capacity: Capacity of the storage ``N``; by default that of the buffer's storage.
         alpha: Priority exponent :math:`\alpha` of Eq. (8).
         beta: Importance exponent :math:`\beta` of Eq. (10), to be raised to 1 over the training.
         eps: :math:`\epsilon` of Eq. (21).
@@ -42,16 +42,16 @@ class MPFASampler(SignalSampler):
         UserWarning: If ``positive_above`` is ``"mean"`` and the fusion not one's own.
 
     Examples:
-        >>> sampler = MPFASampler(100_000)
+        >>> sampler = MPFASampler()
         >>> [type(adjust).__name__ for adjust in sampler.adjustments]
         ['PositiveBoost', 'PositiveDecay']
-        >>> MPFASampler(100_000, positive_above=-1.0).fusion.positive_above
+        >>> MPFASampler(positive_above=-1.0).fusion.positive_above
         -1.0
     """
 
     def __init__(
         self,
-        max_capacity: int,
+        max_capacity: int | None = None,
         alpha: float = 0.6,
         beta: float = 0.4,
         eps: float = 0.05,

@@ -51,7 +51,7 @@ class TreeSampler(SavedTrees):
     only, and a state that does not fit changes nothing.
 
     Args:
-        max_capacity: Capacity of the storage ``N``.
+        max_capacity: Capacity of the storage ``N``; None: that of the storage that is used first.
         alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eq. (9).
@@ -82,7 +82,7 @@ class TreeSampler(SavedTrees):
     @torch.inference_mode(False)
     def __init__(
         self,
-        max_capacity: int,
+        max_capacity: int | None,
         alpha: float,
         beta: float,
         eps: float = 1e-8,
@@ -93,7 +93,10 @@ class TreeSampler(SavedTrees):
         *,
         stratified: bool = False,
     ) -> None:
-        max_capacity = check_counts(max_capacity=max_capacity)
+        # Until a storage is known there is one slot.
+        self._takes_capacity = max_capacity is None
+        capacity = 1 if max_capacity is None else max_capacity
+        capacity = check_counts(max_capacity=capacity)
         alpha = check(_ALPHA, alpha=alpha)
         beta, eps = check(NOT_NEGATIVE, beta=beta, eps=eps)
         if dtype not in (torch.float, torch.double):
@@ -104,7 +107,7 @@ class TreeSampler(SavedTrees):
         # With its number, as storages have it.
         where = None if device is None else torch.empty(0, device=device).device
         rest = dtype, reduction, max_priority_within_buffer, where
-        super().__init__(max_capacity, float(alpha), float(beta), float(eps), *rest)
+        super().__init__(capacity, float(alpha), float(beta), float(eps), *rest)
 
     def _init(self) -> None:
         if self.device.type == "cpu":
@@ -135,7 +138,10 @@ class TreeSampler(SavedTrees):
         return self._device or torch.device("cpu")
 
     def _maybe_init_from_storage(self, storage: Storage | None) -> None:
-        """Move to the device of a storage, once it is known."""
+        """Take the capacity of a storage and move to its device, once they are known."""
+        if self._takes_capacity and storage is not None:
+            self._takes_capacity = False
+            self._resize(storage.max_size)
         device = getattr(storage, "device", None)
         if device == (self._device or _CPU) or not isinstance(device, torch.device):
             return
@@ -145,6 +151,11 @@ class TreeSampler(SavedTrees):
             )
         state, self._device = self.state_dict(), device
         self.load_state_dict(state)
+
+    def _resize(self, capacity: int) -> None:
+        """Begin with empty trees of another capacity."""
+        self._max_capacity = capacity
+        self._init()
 
     @property
     def alpha(self) -> float:

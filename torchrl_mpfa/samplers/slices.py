@@ -10,13 +10,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import check_counts, check_index, unknown
+from torchrl_mpfa.checks import as_mask, check_counts, check_index, unknown
 from torchrl_mpfa.episodes import follows
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.trees import as_slots, leaves_of, set_leaves
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.storages.schema import as_path
-from torchrl_mpfa.storages.table import SignalTable
 
 SlicePriority = Literal["mean", "start"]
 """Priority of a slice: the mean over its steps, or that of its first step."""
@@ -104,12 +103,13 @@ class SignalSliceSampler(SignalSampler):
         self.end_key, self.traj_key = end_key, traj_key
         self.truncated_key = truncated_key
         super().__init__(*args, **kwargs)
-        if slice_len > self._max_capacity:
-            raise ValueError(
-                f"slice_len must be at most max_capacity, {self._max_capacity}, got {slice_len}"
-            )
 
     def _init(self) -> None:
+        if self.slice_len > self._max_capacity and not self._takes_capacity:
+            raise ValueError(
+                f"slice_len must be at most max_capacity, {self._max_capacity}, got "
+                f"{self.slice_len}"
+            )
         if self.device.type != "cpu":
             raise ValueError(f"device must be that of a storage on the CPU, got {self.device}")
         super()._init()
@@ -118,15 +118,15 @@ class SignalSliceSampler(SignalSampler):
         self._stride = 1
         self._lengths = torch.empty(0, dtype=torch.long)
 
-    @property
-    def needed_keys(self) -> list[NestedKey]:
-        """Entries that transitions must have."""
-        return [self.end_key, *([] if self.traj_key is None else [self.traj_key])]
-
-    @property
-    def mask_keys(self) -> list[NestedKey]:
-        """See :attr:`SignalSampler.mask_keys`."""
-        return [self.end_key, *([] if self.truncated_key is None else [self._done_key])]
+    def check_new(self, data: Any, count: int) -> Tensor:
+        """See :meth:`SignalSampler.check_new`; ends and numbers of trajectories must be there."""
+        for key in (self.end_key, *([] if self.traj_key is None else [self.traj_key])):
+            if data.get(key, None) is None:
+                raise KeyError(f"the transitions lack {key!r}, which the sampler reads")
+        for key in (self.end_key, *([] if self.truncated_key is None else [self._done_key])):
+            if (mask := data.get(key, None)) is not None:
+                as_mask(repr(key), mask)
+        return super().check_new(data, count)
 
     @property
     def _done_key(self) -> NestedKey:
@@ -190,17 +190,6 @@ class SignalSliceSampler(SignalSampler):
             starts[wrong] = super()._proportional(tree, size, len(wrong))
         return starts
 
-    def bind(self, storage: Storage) -> SignalTable:
-        """See :meth:`SignalSampler.bind`; what a new storage holds is cut into trajectories."""
-        before = self._table
-        table = super().bind(storage)
-        if table is not before and table.size:
-            slots = torch.arange(self._max_capacity)
-            for part in slots.split(_AT_ONCE):
-                self._join(part, storage)
-            self._refresh(slots)
-        return table
-
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give new steps the highest priority, and record where trajectories end.
 
@@ -209,20 +198,19 @@ class SignalSliceSampler(SignalSampler):
         """
         if storage is None:
             raise ValueError("storage must be given, as it says where trajectories end, got None")
-        slots = check_index(as_slots(index, storage), self._max_capacity)
-        if len(slots) == 0:
-            return
-        self.bind(storage)
-        self._join(slots, storage)
         super().mark_update(index, storage=storage)
         if self.slice_priority == "start":  # Slices that begin before these steps have changed too.
+            slots = check_index(as_slots(index, storage), self._max_capacity)
             self._refresh(self._starts_around(slots))
+
+    def _record(self, slots: Tensor, storage: Storage) -> None:
+        super()._record(slots, storage)
+        for part in slots.split(_AT_ONCE):
+            self._join(part, storage)
 
     def _join(self, slots: Tensor, storage: Any) -> None:
         """Find the slots, and those before them, that the next step of a trajectory follows."""
-        table = super().bind(storage)
-        if table.size == 0:
-            return
+        table = self.table
         shape = getattr(storage, "_total_shape", None) if storage.ndim > 1 else None
         self._stride = 1 if shape is None else math.prod(shape[1:])
         slots = torch.cat([slots - self._stride, slots]) % self._max_capacity

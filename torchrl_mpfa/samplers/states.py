@@ -15,7 +15,8 @@ from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
 from torchrl_mpfa.samplers.trees import leaves_of, set_leaves
 from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
 
-FORMAT = 3
+FORMAT = 4
+_FORMAT_OF_0_4 = 3
 """Version of saved states."""
 
 
@@ -45,10 +46,19 @@ class SavedSampler:
             ValueError: If format, kind or a size differs, or a number is not finite; nothing is
                 changed.
         """
+        if isinstance(state_dict, dict) and state_dict.get("_format") == _FORMAT_OF_0_4:
+            raise ValueError(
+                "'_format' of the saved sampler must be 4, got 3: version 0.4 saved it: load it "
+                "with 0.4, whose signals lay in the storage"
+            )
         check_saved("sampler", state_dict, self.SAVED, _format=FORMAT, _kind=self.KIND)
         twin = object.__new__(type(self))
         vars(twin).update(vars(self))
         twin._restore(state_dict)
+        self._take(twin)
+
+    def _take(self, twin: Any) -> None:
+        """Take over what a twin has loaded."""
         vars(self).update(vars(twin))
 
     def _restore(self, state: dict[str, Any]) -> None:

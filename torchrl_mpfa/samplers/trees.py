@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import is_tensor_collection
 from torch import Tensor
 from torchrl.data import Storage
 
@@ -157,3 +158,19 @@ def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
     values = leaf if flat else leaf.contiguous().numpy()
     for tree in trees:
         tree[places] = values
+
+
+class Steps:
+    """Stored transitions by their flat slots, an entry at a time."""
+
+    def __init__(self, storage: Any, slots: Tensor) -> None:
+        self._slots, self._ndim = slots, storage.ndim
+        stored = storage._storage
+        self._stored = stored if is_tensor_collection(stored) else {}
+
+    def get(self, key: Any, default: Any = None) -> Any:
+        """Return an entry of the transitions, shape ``[B, ...]``."""
+        entry = self._stored.get(key, None)
+        if entry is None:
+            return default
+        return entry.flatten(0, self._ndim - 1)[self._slots.to(entry.device)]

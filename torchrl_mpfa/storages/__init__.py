@@ -1,7 +1,13 @@
-"""TorchRL's storages, with the signals of every slot in addition to the data."""
+"""TorchRL's storages, faster, and with room for the signals of a sampler beside the data."""
 
-from torchrl_mpfa.storages.storage import SignalStorageMixin
-from torchrl_mpfa.storages.table import SignalTable
+from typing import Any
+
+from torchrl_mpfa.lazy import find
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage
 
-__all__ = ["SignalMemmapStorage", "SignalStorageMixin", "SignalTable", "SignalTensorStorage"]
+__all__ = ["SignalMemmapStorage", "SignalTensorStorage"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a module when it is first used."""
+    return find(__name__, name, {})

@@ -1,81 +1,234 @@
-"""The storages: data and signals in memory, or in memory-mapped files."""
+"""The storages: data and the signals of their sampler in memory, or in memory-mapped files."""
 
 from __future__ import annotations
 
+import fcntl
+import json
+import os
+from collections import OrderedDict
+from collections.abc import Mapping
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
-from typing import Any
+from tempfile import NamedTemporaryFile
+from typing import TYPE_CHECKING, Any, Union
 
+import numpy as np
 import torch
-from tensordict import TensorDict, is_tensor_collection
+from numpy.typing import NDArray
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
-from torchrl_mpfa.checks import bounds
-from torchrl_mpfa.storages.storage import SignalStorageMixin
-from torchrl_mpfa.storages.table import allocate
+from torchrl_mpfa.checks import bounds, check_counts, generator_on
+from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
+from torchrl_mpfa.storages.schema import Schema, as_index
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.samplers.table import SignalTable
+
+_MOVED = {
+    "signals": "the sampler alone knows its signals",
+    "reward_key": "give it to the sampler",
+    "allow_nonfinite": "give it to SignalReplayBuffer",
+}
+
+_Entries = dict[str, Union[Tensor, "_Entries"]]
 
 
-class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
-    """:class:`~torchrl.data.LazyTensorStorage` with the signals of every slot next to the data.
+class SignalTensorStorage(LazyTensorStorage):
+    """:class:`~torchrl.data.LazyTensorStorage` that is faster, and holds the signals of a sampler.
 
-    Further arguments and errors: see :class:`~torchrl_mpfa.storages.SignalStorageMixin`.
+    Reading and writing a batch of slots takes half of TorchRL's time where all entries are tensors
+    on the CPU. The table of the first sampler that uses the storage lies beside its data, as
+    ``signal_table``. Any storage of TorchRL's works too: the sampler then keeps the table itself.
+
+    Args:
+        max_size: Capacity ``N``.
+        **kwargs: Arguments of TorchRL's storage. With ``ndim=2`` a slot is a step of one of several
+            environments, as in TorchRL, and ``max_size`` must be a multiple of their number.
+
+    Raises:
+        TypeError: If an argument belongs to sampler or buffer.
+        ValueError: If ``max_size`` is not positive.
 
     Examples:
-        >>> storage = SignalTensorStorage(1000)
-        >>> storage.signal_table.names
-        ['td_error', 'action_gradient', 'reward']
+        >>> storage = SignalTensorStorage(4)
+        >>> storage.set(torch.arange(2), TensorDict({"reward": torch.ones(2)}, [2]))
+        >>> storage.get(torch.tensor([1, 1]))["reward"]
+        tensor([1., 1.])
     """
 
     _storage: Any
+    _rng: torch.Generator | None
+    signal_table: SignalTable | None = None
+    """Table of the sampler that uses the storage; None before the first use."""
     _looked_at: Any = None
     _where: torch.device | None = None
+    _entries: _Entries
 
-    def get(self, index: Any) -> Any:
-        """Read transitions; a batch of slots takes half of the time of indexing."""
-        if (
+    def __init__(self, max_size: int, **kwargs: Any) -> None:
+        max_size = check_counts(max_size=max_size)
+        for name in _MOVED.keys() & kwargs.keys():
+            raise TypeError(f"{name} is no argument of a storage since 0.5: {_MOVED[name]}")
+        super().__init__(max_size, **kwargs)
+
+    def hold(self, table: SignalTable) -> None:
+        """Hold a table of signals beside the data."""
+        self.signal_table = table
+
+    def _takes(self, slots: Any) -> bool:
+        """Return True if a batch of slots can be read and written entry by entry."""
+        return (
             self.initialized
             and self.ndim == 1
-            and isinstance(index, Tensor)
-            and index.is_cpu
-            and index.ndim == 1
-            and len(index) > 0
-            and index.dtype is torch.long
-            and isinstance(self._storage, TensorDict)
-            and index.device == self._device_of_tensors()
-            and _within(index, len(self))
-        ):
-            return _rows_of(self._storage, index)
-        return super().get(index)
+            and isinstance(slots, Tensor)
+            and slots.is_cpu
+            and slots.ndim == 1
+            and 0 < len(slots) <= self.max_size
+            and slots.dtype is torch.long
+            and type(self._storage) is TensorDict
+            and slots.device == self._device_of_tensors()
+        )
 
-    def _settle_loaded(self, signals: dict[str, Any]) -> None:
-        found = self._device_of_tensors() if self.initialized else None
+    def get(self, index: Any) -> Any:
+        """Read transitions; all slots come as a tensordict that shares their tensors."""
+        if self._takes(index):
+            low, high = bounds(index)
+            if low >= 0 and high < len(self):
+                return _rows_of(self._storage, index)
+        rows = super().get(as_index(index))
+        # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
+        return rows.copy() if rows is self._storage and is_tensor_collection(rows) else rows
+
+    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
+        """Write transitions."""
+        cursor = as_index(cursor)
+        if (
+            set_cursor
+            and type(data) is TensorDict
+            and self._takes(cursor)
+            and (pairs := _pairs(self._entries, data)) is not None
+        ):
+            self._set_last_cursor(cursor)
+            with torch.no_grad():
+                for stored, value in pairs:
+                    stored.index_copy_(0, cursor, value)
+            self._len = min(len(self) + len(cursor), self.max_size)
+            self._bump_mutation_revision()
+            return
+        size = len(self)
+        try:
+            super().set(cursor, data, set_cursor=set_cursor)
+        except BaseException:
+            # TorchRL counts the rows before it writes them.
+            self._len = size
+            raise
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        """Write transitions in slots, and have the buffers that use the storage read them."""
+        super().__setitem__(index, value)
+        slots = slots_of(self, index)
+        for buffer in self._attached_entities_iter():
+            buffer.mark_update(slots)
+
+    def _rand_given_ndim(self, batch_size: int) -> Any:
+        """Sample slots uniformly, as TorchRL, which asks for a generator on the device."""
+        source, device = self._rng, getattr(self, "device", None)
+        if not isinstance(device, torch.device):
+            return super()._rand_given_ndim(batch_size)
+        self._rng = generator_on(device, source)
+        try:
+            return super()._rand_given_ndim(batch_size)
+        finally:
+            self._rng = source
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the data, saved on any device.
+
+        Raises:
+            KeyError: If an entry is missing; nothing is changed.
+            ValueError: If the data are of another capacity or form; nothing is changed.
+        """
+        check_saved("storage", state_dict, ("_storage", "_len", "initialized"))
+        data = _of_any_device(state_dict["_storage"])
+        tree = TensorDict()
+        rows = tree.load_state_dict(data, strict=False) if isinstance(data, Mapping) else data
+        self._check_saved(rows, state_dict["_len"])
+        super().load_state_dict({**state_dict, "_storage": data})
+        self._settle_loaded()
+
+    def dumps(self, path: str | Path) -> None:
+        """Save the data in a folder, with checksums, or raise ``OSError`` if it is full."""
+        path = Path(path)
+        path.mkdir(exist_ok=True)
+        if is_tensor_collection(data := self._storage):
+            with NamedTemporaryFile(dir=path) as room:  # TorchRL asks for none.
+                allocate(room.name, data.bytes())
+        super().dumps(path)
+        seal_dump(path, path)
+
+    def loads(self, path: str | Path) -> None:
+        """Restore the data from a folder.
+
+        Raises:
+            ValueError: If a file is damaged, missing, or could execute something, or the data are
+                of another capacity or form; nothing is changed.
+        """
+        path = open_dump(path)
+        notes = json.loads((path / "storage_metadata.json").read_text(encoding="utf-8"))
+        rows = None if notes["is_pytree"] else TensorDict.load_memmap(path, allow_pickle=False)
+        self._check_saved(rows, notes["len"])
+        super().loads(path)
+        self._settle_loaded()
+
+    def _check_saved(self, data: Any, length: Any) -> None:
+        if type(length) is not int or not 0 <= length <= self.max_size:
+            raise ValueError(
+                f"'_len' of the saved storage must be in [0, {self.max_size}], got {length!r}"
+            )
+        if length and isinstance(data, TensorDictBase):
+            slots = data.shape[: self.ndim]
+            if slots.numel() != self.max_size:
+                raise ValueError(
+                    f"the saved storage must have {self.max_size} slots, got {[*slots]}"
+                )
+            stored: Any = self._storage if self.initialized else None
+            if type(stored) is TensorDict and len(stored.keys()):
+                # TorchRL would leave the old values of an entry that is missing.
+                keys = list(stored.keys(True, True))
+                Schema(stored, self.ndim, keys).check(data, self.ndim, whole=True)
+
+    def _settle_loaded(self) -> None:
+        where = self._device_of_tensors() if self.initialized else None
         if getattr(self, "device", None) == "auto":
             # TorchRL finds it out at the first write, which a restored storage has had.
-            self.device = (found or torch.device("cpu")) if self.initialized else "auto"
-        elif found not in (None, self.device):
+            self.device = (where or torch.device("cpu")) if self.initialized else "auto"
+        elif where not in (None, self.device):
             # What was saved on another device.
             self._storage = self._storage.to(self.device)
-        super()._settle_loaded(signals)
-        self._settle_device()
 
     def _device_of_tensors(self) -> torch.device | None:
         """Return the device of all entries; None if one is no tensor, which TorchRL reads."""
         if self._looked_at is not self._storage:
             self._looked_at, self._where = self._storage, _common_device(self._storage)
+            self._entries = _entries_of(self._storage) if self._where is not None else {}
         return self._where
 
+    def __getstate__(self) -> Any:
+        # The copy looks at its own data.
+        return {**super().__getstate__(), "_looked_at": None, "_entries": {}}
 
-class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
-    """:class:`~torchrl.data.LazyMemmapStorage` with the signals of every slot next to the data.
+
+class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
+    """:class:`~torchrl.data.LazyMemmapStorage` that is faster, and holds the signals of a sampler.
 
     With ``scratch_dir`` the signals are memory-mapped too, to ``scratch_dir/signals.memmap``;
     without it they stay in memory, 8 bytes a column and slot. A pickled or copied storage has
     temporary files of its own. A load writes into the files once the state was found to fit; if
     the disk then fails, the storage is left half loaded.
 
-    Further arguments and errors: see :class:`~torchrl_mpfa.storages.SignalStorageMixin`.
+    Further arguments: see :class:`SignalTensorStorage`.
 
     Args:
         max_size: Capacity ``N``.
@@ -91,11 +244,13 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
     Examples:
         >>> import tempfile
         >>> storage = SignalMemmapStorage(1000, scratch_dir=tempfile.mkdtemp())
-        >>> storage.signal_table.rows.shape
-        torch.Size([1000, 6])
+        >>> storage.signal_table is None
+        True
     """
 
-    _storage: Any
+    _claim: NDArray[np.float64] | None = None
+    """The begin of the file of the signals."""
+    _file: Path
 
     def __init__(
         self,
@@ -106,12 +261,23 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         **kwargs: Any,
     ) -> None:
         if scratch_dir is not None:
-            self._mapped = {"file": Path(scratch_dir) / "signals.memmap", "existsok": existsok}
+            self._file = Path(scratch_dir) / "signals.memmap"
+            self._claim = _claimed(self._file, existsok=existsok)
         super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
+
+    def hold(self, table: SignalTable) -> None:
+        """Hold a table of signals beside the data, in a file if they are in a folder."""
+        if self._claim is not None:
+            allocate(self._file, 8 * table.rows.numel())
+            mapped = np.memmap(self._file, np.float64, "r+", shape=tuple(table.rows.shape))
+            table.move_to(torch.from_numpy(mapped))
+        super().hold(table)
 
     def _init(self, data: Any) -> None:
         super()._init(data)
-        entries = tree_leaves(self._storage)
+        # Texts and the like are kept in memory.
+        leaves = tree_leaves(self._storage)
+        entries = [entry for entry in leaves if isinstance(entry, MemoryMappedTensor)]
         files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
         try:
             for file in files:
@@ -124,7 +290,7 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
             raise
 
     def __getstate__(self) -> Any:
-        state = super().__getstate__()
+        state = {**super().__getstate__(), "_claim": None}
         if get_spawning_popen() is None:
             # The copy has files of its own. Processes that TorchRL starts share those of this one.
             state |= {"scratch_dir": None, "_scratch_dir_is_temp": True}
@@ -137,6 +303,14 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         data: Any = self._storage if self.initialized else None
         if is_tensor_collection(data) and not data.is_memmap():
             self._storage = data.memmap()
+
+
+def slots_of(storage: Any, index: Any) -> Tensor:
+    """Return the flat slots that an index of a storage names, shape ``[B]``."""
+    slots = torch.arange(storage.max_size)
+    if storage.ndim > 1:
+        slots = slots.reshape(storage._total_shape)
+    return slots[list(index) if isinstance(index, range) else index].reshape(-1)
 
 
 def _common_device(data: Any) -> torch.device | None:
@@ -160,7 +334,81 @@ def _rows_of(data: TensorDict, index: Tensor) -> TensorDict:
     return TensorDict._new_unsafe(rows, batch_size=size, device=data.device)
 
 
-def _within(index: Tensor, size: int) -> bool:
-    """Return True if all slots are filled ones, counted from the front."""
-    low, high = bounds(index)
-    return low >= 0 and high < size
+def _entries_of(data: Any) -> _Entries:
+    """Return the tensors of a tensordict by name, which take a tenth of its own access."""
+    if not isinstance(data, TensorDictBase):
+        return {}
+    return {
+        key: _entries_of(value) if isinstance(value, TensorDictBase) else value
+        for key, value in data.items()
+    }
+
+
+def _pairs(stored: _Entries, data: TensorDictBase) -> list[tuple[Tensor, Tensor]] | None:
+    """Return the tensors of a storage with their new values; None where TorchRL has to write."""
+    pairs: list[tuple[Tensor, Tensor]] = []
+    count = 0
+    for key, value in data.items():
+        entry = stored.get(key)
+        if isinstance(entry, Tensor):
+            if (
+                not isinstance(value, Tensor)
+                or entry.device != value.device
+                or entry.dtype is not value.dtype
+                or entry.shape[1:] != value.shape[1:]
+            ):
+                return None
+            pairs.append((entry, value))
+        elif entry is None or type(value) is not TensorDict:
+            return None
+        else:
+            below = _pairs(entry, value)
+            if below is None:
+                return None
+            pairs += below
+        count += 1
+    return pairs if count == len(stored) else None
+
+
+def _of_any_device(data: Any) -> Any:
+    """Return saved data without the name of their device, for which another one rejects them."""
+    metadata = getattr(data, "_metadata", None)
+    if metadata is None:
+        return data
+    copied = OrderedDict(data)
+    copied._metadata = {name: {**note, "device": None} for name, note in metadata.items()}  # type: ignore[attr-defined]
+    return copied
+
+
+def allocate(path: str | Path, size: int = 0) -> None:
+    """Reserve room on the disk for a file that is mapped to memory, or raise ``OSError``.
+
+    A write to a mapped file for which the disk has no room would kill the process.
+    """
+    with open(path, "r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size or os.path.getsize(path) or 1)
+        except OSError as error:
+            error.filename = str(path)
+            raise
+
+
+def _claimed(file: Path, *, existsok: bool) -> NDArray[np.float64]:
+    """Map the begin of a file of signals, which is locked as long as the mapping lives."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Opened without emptying it: it may be another's.
+    with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as opened:
+        try:
+            # The mapping holds on to the lock after the file is closed.
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise FileExistsError(
+                f"{file} is in use by a living storage: give each a scratch_dir of its own"
+            ) from None
+        if file.stat().st_size and not existsok:
+            raise FileExistsError(
+                f"{file} is there from an earlier storage: pass existsok=True to overwrite it"
+            )
+        opened.truncate(0)
+        allocate(file, 8)
+        return np.memmap(opened, dtype=np.float64, mode="w+", shape=(1,))
