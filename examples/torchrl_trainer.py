@@ -4,7 +4,7 @@
     python examples/torchrl_trainer.py --frames 20000 --seed 1
     python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, new worlds
 
-``torchrl_config.py`` composes the same from Hydra's groups.
+``torchrl_config.py`` makes the same of Hydra's files.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import torchrl_ddpg
 import torchrl_sac
 import torchrl_trainer
 import tune
-from benchmarks import drivers, pictures, sampling
+from benchmarks import drivers, pictures, sampling, stops
 from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.values import __main__ as values
@@ -63,6 +63,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "benchmarks.speed.worlds": worlds.main,
     "benchmarks.values": values.main,
     "benchmarks.paper": paper.main,
+    "benchmarks.stops": stops.main,
     "benchmarks.drivers": drivers.main,
     "benchmarks.pictures": pictures.main,
     "benchmarks.sampling": sampling.main,

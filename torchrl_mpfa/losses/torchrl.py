@@ -7,7 +7,15 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, LossModule, SACLoss, TD3Loss
+from torchrl.objectives import (
+    DDPGLoss,
+    DiscreteSACLoss,
+    DQNLoss,
+    LossModule,
+    SACLoss,
+    TD3Loss,
+    TQCLoss,
+)
 
 from torchrl_mpfa.losses.functional import action_gradient
 from torchrl_mpfa.priorities import action_gradient_priority
@@ -54,7 +62,8 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
         >>> sorted(batch["signals"].keys())
         ['action_gradient', 'td_error']
     """
-    if not isinstance(loss, SUPPORTED):
+    # The values of TQC are quantiles.
+    if not isinstance(loss, SUPPORTED) or isinstance(loss, TQCLoss):
         raise TypeError(
             "loss must be TorchRL's DDPGLoss, TD3Loss, SACLoss, DQNLoss or DiscreteSACLoss, got "
             f"{type(loss).__name__}: write batch['signals', 'td_error'] yourself"
