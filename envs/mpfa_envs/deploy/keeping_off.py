@@ -21,9 +21,19 @@ _PARTS: Final = 5
 """Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
 
 
-def filter_of(card: Card, robot: RobotModel, pace: float, clearance: float) -> SafetyFilter:
-    """The filter of the task that a policy learned, for the robot that drives."""
+def filter_of(
+    card: Card, robot: RobotModel, pace: float, clearance: float | None
+) -> SafetyFilter | None:
+    """The filter of the task that a policy learned, for the robot that drives; None: no filter."""
     learned = card.robot
+    if clearance is None:
+        return None
+    if not learned.can_stop:
+        raise ValueError(
+            f"clearance must be None for a policy of {learned.name}, whose wheels turn at "
+            f"{learned.min_wheel_speed} m/s at least: no filter can promise that it touches "
+            f"nothing, got {clearance}"
+        )
     braking = robot.wheel_limits.acceleration / widening(robot, learned)
     braking = min(learned.wheel_limits.acceleration, braking / pace**2)
     turns = min(turning(learned), turning(robot) / pace**2)

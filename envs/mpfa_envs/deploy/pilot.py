@@ -7,23 +7,19 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import (
-    MEANT,
-    check_not_negative,
-    check_number,
-    check_positive,
-)
+from mpfa_envs.checks import check_not_negative, check_number, check_positive
 from mpfa_envs.deploy.arrival import Arrival
 from mpfa_envs.deploy.card import Card, check_finite, read_exported
 from mpfa_envs.deploy.keeping_off import filter_of
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.pace import pace_of, tolerance
+from mpfa_envs.deploy.places import check_on_map, pair_of, placed, sides_of
 from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
+from mpfa_envs.deploy.views import observations_from
 from mpfa_envs.deploy.way_back import WayBack
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
 
 if TYPE_CHECKING:
     import os
@@ -38,12 +34,6 @@ _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
 _BESIDE: Final = 0.01
 """Cosine above which a direction is ahead."""
-_FARTHEST: Final = 1e7
-"""Largest coordinate of a place [m]; those of UTM are smaller."""
-_LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
-"""Side of the square around a robot in which its goal must be, without a map, too [m]."""
-_REDUCED: Final = 3
-"""Rays of a sector of a scan that is seen from another pose."""
 
 
 class Command(NamedTuple):
@@ -115,14 +105,14 @@ class Pilot:
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
-        learned = card.robot
-        self.pace = pace_of(self.robot, learned, pace)
-        self.latency = self.robot.latency if latency is None else latency
-        check_not_negative("latency", self.latency)
+        self.pace = pace_of(self.robot, card.robot, pace)
+        late = self.robot.latency if latency is None else latency
+        self.latency = check_not_negative("latency", late)
         mount = self.robot.lidar_mount if mount is None else mount
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
-        self._map_size = check_positive("map_size", map_size)
+        side = check_positive("map_size", map_size)
+        self._map_size = side if card.memory == "map" else None
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
@@ -133,21 +123,13 @@ class Pilot:
             from mpfa_envs.deploy.map_path import MapPath
 
             self._map = MapPath(card)
-        if clearance is not None and not learned.can_stop:
-            raise ValueError(
-                f"clearance must be None for a policy of {learned.name}, whose wheels turn at "
-                f"{learned.min_wheel_speed} m/s at least: no filter can promise that it touches "
-                f"nothing, got {clearance}"
-            )
-        self._keep = (
-            None if clearance is None else filter_of(card, self.robot, self.pace, clearance)
-        )
+        self._keep = filter_of(card, self.robot, self.pace, clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._plan: Plan | None = None
         self._fresh_map = False
         self._fresh = True
-        self._way_back = WayBack(learned, self.period)
+        self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
@@ -227,20 +209,20 @@ class Pilot:
                 f"heading must be None for {self.robot.name}, which cannot turn on the spot "
                 f"(min_wheel_speed = {self.robot.min_wheel_speed}), got {heading}"
             )
-        center = None if map_center is None else _pair("map_center", map_center)
-        goal = _pair("goal", goal)
-        placed = None
+        center = None if map_center is None else pair_of("map_center", map_center)
+        goal = pair_of("goal", goal)
+        ground = None
         if plan is not None:
             if self._map is None or center is not None:
                 raise ValueError(
                     "plan must be None for a policy without a map (memory='map'), and with a "
                     f"map_center, got {plan.name!r}"
                 )
-            placed = _placed(plan, plan_pose)
-            center = placed.middle
-        self._check_on_map(goal, center, placed)
+            ground = placed(plan, plan_pose)
+            center = ground.middle
+        check_on_map(goal, center, ground, self._map_size)
         self._arrival.begin(heading)
-        self._goal, self._center, self._plan, self._fresh = goal, center, placed, True
+        self._goal, self._center, self._plan, self._fresh = goal, center, ground, True
         self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
@@ -262,8 +244,8 @@ class Pilot:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
         if heading is not None and self._arrival.heading is not None:
             self._arrival.heading = check_number("heading", heading)
-        if (goal := _pair("goal", goal)) != self._goal:
-            self._check_on_map(goal, self._center, self._plan)
+        if (goal := pair_of("goal", goal)) != self._goal:
+            check_on_map(goal, self._center, self._plan, self._map_size)
             self._goal = goal
             if self._map is not None:
                 self._map.look_again()
@@ -281,7 +263,7 @@ class Pilot:
         """
         if self._plan is None:
             raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
-        moved = _placed(self._plan.world, pose)
+        moved = placed(self._plan.world, pose)
         if self._plan.is_off(moved.pose):
             self._plan, self._center, self._fresh_map = moved, moved.middle, True
 
@@ -335,7 +317,7 @@ class Pilot:
         if self._goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
-        _pair("pose", (x, y))
+        pair_of("pose", (x, y))
         motion = np.array((x, y, heading, *check_finite("speeds", speeds, 2)))
         taken = np.array(check_finite("scan_pose", scan_pose or (x, y, heading), 3))
         self._time = self._time + self.period if time is None else time
@@ -346,48 +328,19 @@ class Pilot:
         self.give(self._time, 0.0, 0.0)
         card = self.card
         center = self._center or (x, y)
-        self._check_on_map(self._goal, center, self._plan)
+        check_on_map(self._goal, center, self._plan, self._map_size)
         ranges, points = self.sectors.read(scan)
         path = np.zeros((0, 3))
         if self._map is not None:
             if self._fresh or self._fresh_map:
-                self._map.begin(center, self._sides(self._plan), self._plan)
+                self._map.begin(center, sides_of(self._plan, self._map_size), self._plan)
                 self._center, self._fresh_map = center, False
             path = self._map.sense(ahead[0], taken, self._goal, points)
-        robot = card.robot
-        rows = []
-        for state in ahead:
-            seen = ranges
-            if (state[:3] != taken).any():
-                seen = np.empty(card.sectors * (1 if card.reduction == "single" else _REDUCED))
-                view = math.radians(card.field_of_view)
-                look_from(
-                    lidar_pose(state, robot.lidar_mount[0], robot.lidar_mount[1]),
-                    *points,
-                    taken,
-                    card.max_range,
-                    view,
-                    seen,
-                )
-            observation = self._observation.copy()
-            observe_all(
-                np.array([[*state[:3], *(state[3:] / self.pace)]]),
-                np.array([self._goal]),
-                np.array([math.dist(state[:2], self._goal)]),
-                np.array([self._fresh]),
-                np.ones(1, dtype=np.bool_),
-                seen[None],
-                card.reduction == "median",
-                (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
-                path,
-                card.sectors,
-                card.history,
-                observation,
-            )
-            rows.append(observation[0])
+        facts = self._goal, self._fresh, path, self.pace
+        rows = observations_from(ahead, ranges, points, taken, card, self._observation, *facts)
         self._observation[0] = rows[0]
         self._fresh = False
-        return rows[0], np.array(rows), float(ahead[0, 2] - taken[2])
+        return rows[0], rows, float(ahead[0, 2] - taken[2])
 
     def give(self, time: float, linear: float, angular: float) -> None:
         """Remember what was ordered, where that is not what the pilot has decided.
@@ -494,41 +447,3 @@ class Pilot:
         now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
         left, right = changed(now, to, limits, limits.acceleration, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half
-
-    def _sides(self, plan: Plan | None) -> tuple[float, float]:
-        """Width and depth of the map [m]."""
-        side = _LARGEST_MAP if self._map is None else self._map_size
-        return (side, side) if plan is None else plan.size
-
-    def _check_on_map(
-        self, goal: tuple[float, float], center: tuple[float, float] | None, plan: Plan | None
-    ) -> None:
-        """Reject a goal beyond the map, once its center is known, or one in another unit."""
-        if center is None:
-            return
-        width, depth = self._sides(plan)
-        if abs(goal[0] - center[0]) > 0.5 * width or abs(goal[1] - center[1]) > 0.5 * depth:
-            size = f"{width:g} m" + " (map_size)" * (self._map is not None)
-            if plan is not None:
-                size = f"{width:g} m x {depth:g} m (plan)"
-            raise ValueError(
-                f"goal must be on the map, {size} around "
-                f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
-            )
-
-
-def _placed(world: World, pose: tuple[float, float, float]) -> Plan:
-    """A plan at a pose."""
-    # Imported here because it needs Numba.
-    from mpfa_envs.deploy.map_path import Plan
-
-    x, y, heading = check_finite("plan_pose", pose, 3)
-    return Plan(world, (*_pair("plan_pose", (x, y)), heading))
-
-
-def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:
-    """Two finite numbers within the range of observations."""
-    x, y = check_finite(name, place, 2)
-    if max(abs(x), abs(y)) > _FARTHEST:
-        raise ValueError(f"{name} must be within {_FARTHEST:g} m of the origin, got {place}")
-    return x, y
