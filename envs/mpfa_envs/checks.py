@@ -11,8 +11,6 @@ from typing import Any, Final, get_args
 MOST: Final = 100_000
 """Largest count by default: robots, episodes, worlds, rays and scans are made one by one or held at
 once, and a typing error must not take all time or memory."""
-
-
 _SLIPS: Final[Mapping[str, Mapping[str, float]]] = {
     "m": {"millimeters": 1e-3, "centimeters": 1e-2},
     "m/s": {"mm/s": 1e-3, "cm/s": 1e-2},
