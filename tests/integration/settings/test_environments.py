@@ -162,6 +162,7 @@ def test_the_ids_are_the_tasks_that_the_regimes_learn(
     # When robots are reset is decided by whoever steps them.
     for arguments in (mine, theirs):
         del arguments["autoreset_mode"]
+        assert arguments.pop("lidar.mount") == [0.0, 0.0]
     # The regime scales the closeness of a robot that can stop by its radius alone.
     theirs["closeness_distance"] += changed.get("clearance", 0.0)
     assert mine == pytest.approx(theirs)

@@ -362,7 +362,7 @@ def test_what_cannot_be_on_a_command_line_is_one_sentence_with_its_name(
 
 
 OF_PARTS = {
-    *("physics", "max_steps", "action_repeat", "detour_chance", "progress", "memory"),
+    *("physics", "max_steps", "action_repeat", "detour_chance", "progress", "memory", "plan"),
     *("noise.range_noise", "noise.dropout", "noise.slip", "noise.drift", "latency"),
 }
 """Settings of the environment that the parts of the task check."""
