@@ -15,10 +15,7 @@ from torchrl.data import Storage
 from torchrl_mpfa.adjustment import (
     Adjustment,
     BatchFacts,
-    PositiveBoost,
     counts_buffer,
-    is_positive,
-    level_of,
     one_sided,
 )
 from torchrl_mpfa.checks import (
@@ -30,6 +27,7 @@ from torchrl_mpfa.checks import (
     unknown,
 )
 from torchrl_mpfa.fusion import Annealed, FixedFusion, Fusion, checked_weights, fuse
+from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.table import SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
@@ -385,44 +383,7 @@ class SignalSampler(TreeSampler):
 
     def stats(self) -> dict[str, float]:
         """Return the composition of buffer and last batch by name, see ``docs/metrics.md``."""
-        table, weights = self.table, self.weights
-        found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
-        for place, adjust in enumerate(self.adjustments):
-            if isinstance(adjust, PositiveBoost):
-                counted = () if self._weighing is None else self._weighing.counted
-                factor = adjust.factor(counted[place] if counted else None)
-                found.setdefault("boost_factor", float(factor))
-        if table.size == 0:
-            return found
-        level, mean = level_of((*self.adjustments, self.fusion)), float(table.rewards.mean())
-        positive = is_positive(table.rewards, level, mean=mean)
-        found["positive_fraction_buffer"] = float(positive.double().mean())
-        if self._last_batch is None:
-            return found
-        index, importance = self._last_batch
-        rows = table.rows[index]
-        if (entropies := getattr(self.fusion, "entropies", None)) is not None:
-            values = entropies(self._names, table, index).tolist()
-            found |= {f"entropy/{n}": v for n, v in zip(self._names, values, strict=True)}
-        known = rows[:, table.fused]
-        known = known[~known.isnan().any(1)]
-        if weights and len(known):
-            # Shares in the mean priority of Eq. (21); equal ones if every signal is zero.
-            parts = known.mean(0) * self._ordered(weights)
-            shares = (
-                parts / parts.sum() if parts.sum() > 0 else torch.full_like(parts, 1 / len(parts))
-            )
-            found |= {f"share/{n}": v for n, v in zip(self._names, shares.tolist(), strict=True)}
-        positive = is_positive(rows[:, table.reward_column], level, mean=mean)
-        age = table.writes - 1 - rows[:, table.time_column]
-        return {
-            **found,
-            "positive_fraction_batch": float(positive.double().mean()),
-            "effective_sample_size": float(importance.sum().square() / importance.square().sum()),
-            "sampled_age_mean": float(age.mean()),
-            "sampled_age_max": float(age.max()),
-            "replay_count_mean": float(rows[:, table.count_column].mean()),
-        }
+        return composition(self, self._weighing, self._last_batch)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on; tensors and plain values only."""

@@ -30,7 +30,9 @@ from torchrl_mpfa.samplers.trees import (
     in_dimensions_of,
     last_of_each,
     leaves_of,
+    random_shares,
     set_leaves,
+    slots_at,
 )
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
@@ -313,19 +315,11 @@ class TreeSampler(SavedTrees):
 
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
         """Sample slots in proportion to the leaves of a tree of sums, shape ``[B]``."""
-        mass = self._mass(batch_size).mul_(tree.query(0, size))
-        index: Tensor = tree.scan_lower_bound(mass)
-        # Rounding can carry the last bit of mass past the last slot.
-        return index.clamp_max_(size - 1)
+        return slots_at(self._mass(batch_size), tree, size)
 
     def _mass(self, batch_size: int) -> Tensor:
         """Sample shares of the total priority to look up, in [0, 1), shape ``[B]``."""
-        random = self._random()
-        mass = torch.rand(batch_size, dtype=torch.double, **random)
-        if not self.stratified:
-            return mass
-        # In random order: in a batch sorted by slot, a place would depend on the age.
-        return mass.add_(torch.randperm(batch_size, **random)).div_(batch_size)
+        return random_shares(batch_size, stratified=self.stratified, **self._random())
 
     def _random(self) -> dict[str, Any]:
         """Return the device, and a generator on it for the random numbers of one call."""

@@ -174,3 +174,19 @@ class Steps:
         if entry is None:
             return default
         return entry.flatten(0, self._ndim - 1)[self._slots.to(entry.device)]
+
+
+def random_shares(count: int, *, stratified: bool, **random: Any) -> Tensor:
+    """Sample shares in [0, 1), from all of it or from each of so many equal parts, ``[B]``."""
+    shares = torch.rand(count, dtype=torch.double, **random)
+    if not stratified:
+        return shares
+    # In random order: in a batch sorted by slot, a place would depend on the age.
+    return shares.add_(torch.randperm(count, **random)).div_(count)
+
+
+def slots_at(shares: Tensor, tree: Any, size: int) -> Tensor:
+    """Return the slots at shares of the sum of a tree, which become masses in place, ``[B]``."""
+    slots: Tensor = tree.scan_lower_bound(shares.mul_(tree.query(0, size)))
+    # Rounding can carry the last bit of mass past the last slot.
+    return slots.clamp_max_(size - 1)
