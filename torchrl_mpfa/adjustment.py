@@ -8,34 +8,26 @@ https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, get_args, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import BELOW_ONE, LEVEL, POSITIVE, Rule, keep
+from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, Rule, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
 
 Level = float | Literal["mean"]
 """A reward, or ``"mean"``: the mean reward of the buffer."""
-_ENOUGH = 1000
-"""With fewer rewards there is no warning that all are on one side."""
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 _BOUND: Rule = (lambda word: word in get_args(Bound), "'floor', 'cap' or 'none'")
 _POSITION: Rule = (lambda word: word in get_args(Position), "'batch', 'rank' or 'count'")
 _ROUNDING = 64
 """Units in the last place by which a priority has to exceed the mean of its batch."""
-
-
-def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
-    """Mask of positive transitions, :math:`r_i > 0` in the paper (Eqs. 17, 22-24), ``[B]``."""
-    return reward > (mean if positive_above == "mean" else positive_above)
 
 
 def boost_positive(
@@ -134,47 +126,57 @@ class BatchFacts:
         reward: Signed rewards, shape ``[B]``.
         replay_count: How often each was sampled so far, this batch included, shape ``[B]``.
         index: Slots in the storage, shape ``[B]``.
-        mean_reward: Mean reward of the buffer when its probabilities were last counted.
+        level: Reward above which a transition is positive.
         written_at: When each was written, as a count of writes, shape ``[B]``; None if unknown.
-        counted: What the adjustment that is asked counted over the buffer, if it is
-            :class:`Counting`; None before its first count.
+        counted: Result of :meth:`Adjustment.count` for the adjustment that is asked; None before
+            its first count.
     """
 
     reward: Tensor
     replay_count: Tensor
     index: Tensor
-    mean_reward: float = 0.0
+    level: float = 0.0
     written_at: Tensor | None = None
     counted: Tensor | None = None
 
+    @property
+    def positive(self) -> Tensor:
+        """Mask of positive transitions, :math:`r_i > 0` in the paper (Eqs. 22-24), ``[B]``."""
+        return self.reward > self.level
 
-@runtime_checkable
-class Adjustment(Protocol):
-    """A change of the priorities of a batch; any callable of this form will do.
 
-    If it has an attribute ``takes_batches`` that is true, it may be given several batches at once:
-    then each ``[B]`` is ``[U, B]``.
+class Adjustment:
+    """A change of the priorities of a batch.
+
+    An adjustment of your own is a subclass with its ``__call__``.
+
+    Examples:
+        >>> class Half(Adjustment):
+        ...     def __call__(self, priority, batch):
+        ...         return 0.5 * priority
+        >>> facts = BatchFacts(torch.tensor([1.0]), torch.ones(1), torch.arange(1))
+        >>> Half()(torch.tensor([3.0]), facts)
+        tensor([1.5000])
     """
 
-    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
-        """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
-        ...
+    takes_batches: ClassVar[bool] = False
+    """True if several batches may come at once: then each ``[B]`` is ``[U, B]``.
 
+    A subclass says so itself, as its ``__call__`` may take one batch alone."""
+    uses_level: ClassVar[bool] = False
+    """True if the adjustment depends on which transitions are positive."""
 
-@runtime_checkable
-class Counting(Protocol):
-    """An adjustment that depends on the whole buffer, which is counted from time to time.
-
-    The result is handed to it as ``BatchFacts.counted``, and saved with the sampler.
-    """
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.takes_batches = vars(cls).get("takes_batches", False)
 
     @property
     def counts(self) -> bool:
-        """True if the adjustment counts at all."""
-        ...
+        """True if the adjustment depends on the whole buffer, which is counted now and then."""
+        return False
 
     def count(self, table: SignalTable, priority: Tensor) -> Tensor:
-        """Count.
+        """Count the buffer, for ``BatchFacts.counted``; the result is saved with the sampler.
 
         Args:
             table: Signals, rewards and times of every slot, ``N`` of which are filled.
@@ -184,24 +186,20 @@ class Counting(Protocol):
         Returns:
             Finite numbers, of the same shape each time.
         """
-        ...
+        raise NotImplementedError(f"{type(self).__name__} must have a method count()")
 
-
-def counts_buffer(adjustment: object) -> bool:
-    """Return True if an adjustment counts the buffer."""
-    return bool(getattr(adjustment, "counts", False))
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
+        raise NotImplementedError(f"{type(self).__name__} must have a method __call__()")
 
 
 @dataclass(frozen=True)
-class PositiveBoost:
+class PositiveBoost(Adjustment):
     r"""Eq. (22) for positive transitions, all others unchanged.
 
     Args:
         boost: Factor :math:`\varphi`; with ``target_share`` its upper bound.
         bound: See :func:`boost_positive`.
-        positive_above: A transition is positive when its reward is above this. With 0 (the paper)
-            every step towards the goal is; a value just under the goal reward leaves only goals,
-            and ``"mean"``, the mean reward of the buffer, suits rewards of one sign.
         target_share: Share of the total priority that :func:`adaptive_boost` gives positive
             transitions, by a factor that follows how many the buffer holds; 0: a fixed factor.
 
@@ -216,12 +214,12 @@ class PositiveBoost:
 
     boost: float = 3.0
     bound: Bound = "floor"
-    positive_above: Level = 0.0
     target_share: float = 0.0
     takes_batches: ClassVar[bool] = True
+    uses_level: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        keep(self, boost=POSITIVE, positive_above=LEVEL, target_share=BELOW_ONE, bound=_BOUND)
+        keep(self, boost=POSITIVE, target_share=BELOW_ONE, bound=_BOUND)
         if self.target_share > 0 and self.boost < 1:
             raise ValueError(f"boost must be at least 1 with a target_share, got {self.boost}")
 
@@ -232,9 +230,7 @@ class PositiveBoost:
 
     def count(self, table: SignalTable, priority: Tensor) -> Tensor:
         """Return the share of positive transitions in the buffer, shape ``[]``."""
-        rewards = table.rewards
-        mean = float(rewards.mean())
-        return is_positive(rewards, self.positive_above, mean=mean).double().mean()
+        return (table.rewards > table.level).double().mean()
 
     def factor(self, counted: Tensor | None) -> float | Tensor:
         """Return the factor by the result of :meth:`count`; before a count, ``boost``."""
@@ -245,12 +241,11 @@ class PositiveBoost:
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Boost the positive transitions, shape ``[B]``."""
         raised = boost_positive(priority, boost=self.factor(batch.counted), bound=self.bound)
-        positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
-        return torch.where(positive, raised, priority)
+        return torch.where(batch.positive, raised, priority)
 
 
 @dataclass(frozen=True)
-class PositiveDecay:
+class PositiveDecay(Adjustment):
     r"""Eqs. (23)-(24): positive transitions above the batch mean decay once trained on.
 
     Args:
@@ -259,7 +254,6 @@ class PositiveDecay:
             in the batch, counted from 1, an arbitrary order; ``"rank"``: place when sorted by
             falling priority, so that the highest decays most; ``"count"``: how often the
             transition was replayed.
-        positive_above: As in :class:`PositiveBoost`.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -272,11 +266,11 @@ class PositiveDecay:
 
     sharpness: float = 0.01
     position: Position = "batch"
-    positive_above: Level = 0.0
     takes_batches: ClassVar[bool] = True
+    uses_level: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        keep(self, sharpness=POSITIVE, positive_above=LEVEL, position=_POSITION)
+        keep(self, sharpness=POSITIVE, position=_POSITION)
 
     def factors(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Return the factor of Eq. (23) for each transition, shape ``[B]``."""
@@ -296,10 +290,9 @@ class PositiveDecay:
         # A number is faster on the CPU; a GPU would be waited for.
         threshold = mean.item() if mean.is_cpu and mean.ndim == 0 else mean.unsqueeze(-1)
         decayed = priority * self.factors(priority, batch)
-        positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
         # The mean of equal numbers may be rounded to below them.
         above = priority > threshold * (1.0 + _ROUNDING * torch.finfo(priority.dtype).eps)
-        return torch.where(positive & above, decayed, priority)
+        return torch.where(batch.positive & above, decayed, priority)
 
 
 @lru_cache(maxsize=64)
@@ -309,33 +302,3 @@ def _factors_by_place(
     """Return factors of places 1 to ``count``: the same for every batch of that size."""
     places = torch.arange(1, count + 1, dtype=dtype, device=device)
     return decay_factor(places, sharpness=sharpness)
-
-
-def level_of(parts: Iterable[object]) -> Level:
-    """Return the first ``positive_above`` among the parts, or 0."""
-    levels = (getattr(getattr(part, "fusion", part), "positive_above", None) for part in parts)
-    return next((level for level in levels if level is not None), 0.0)
-
-
-def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
-    """Return a warning if all rewards of a buffer are on one side of a level of the parts.
-
-    There is none for few rewards, nor for rewards that are all equal, which no level separates.
-    """
-    if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
-        return None
-    # A fusion may stand around another one.
-    inner = [getattr(part, "fusion", part) for part in parts]
-    found = [(getattr(part, "positive_above", "mean"), hasattr(part, "weights")) for part in inner]
-    for level in {level for level, _ in found if level != "mean"}:
-        above = int((rewards > float(level)).sum())
-        # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
-        waits = above == 0 and float(level) > 0 and (level, True) not in found
-        if above in (0, len(rewards)) and not waits:
-            return (
-                f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
-                f"above {level}: by Eq. (17) TD error and gradient get no weight next to the "
-                "reward, and boost and decay separate no transitions. Set positive_above to a "
-                "level between the rewards, or to 'mean', with which all weights are equal"
-            )
-    return None

@@ -13,8 +13,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import ReplayBuffer, Transition
-from torchrl.data.replay_buffers import PrioritizedSampler
+from torchrl.data import ReplayBuffer, Storage, Transition, Writer
+from torchrl.data.replay_buffers import PrioritizedSampler, Sampler
+from torchrl.envs.transforms import Transform
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_generator
 from torchrl_mpfa.samplers.fused import SignalSampler
@@ -50,10 +51,16 @@ class SignalReplayBuffer(CheckedReplayBuffer):
     in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``, ``buffer[key] = ...``).
 
     Args:
+        storage: Where the transitions are; any storage of TorchRL's.
+        sampler: How batches are sampled; any sampler of TorchRL's.
+        writer: Where the next transition is written; any writer of TorchRL's.
+        transform: Transform of what is written and sampled.
+        batch_size: ``B``, for :meth:`sample` without one.
+        priority_key: Where a first priority is given with a transition.
         allow_nonfinite: Entries that may hold NaN and infinities; none by default.
         generator: Source of all randomness of the buffer; by default a new one, seeded by
             ``torch.manual_seed``. Its state is saved with the buffer.
-        **kwargs: Passed to :class:`~torchrl.data.TensorDictReplayBuffer`.
+        **kwargs: Further arguments of :class:`~torchrl.data.TensorDictReplayBuffer`.
 
     Raises:
         TypeError: If ``generator`` is no generator.
@@ -83,6 +90,12 @@ class SignalReplayBuffer(CheckedReplayBuffer):
     def __init__(
         self,
         *,
+        storage: Storage | Callable[[], Storage] | None = None,
+        sampler: Sampler | Callable[[], Sampler] | None = None,
+        writer: Writer | Callable[[], Writer] | None = None,
+        transform: Transform | Callable[[Any], Any] | None = None,
+        batch_size: int | None = None,
+        priority_key: str = "td_error",
         allow_nonfinite: Sequence[NestedKey] = (),
         generator: torch.Generator | None = None,
         **kwargs: Any,
@@ -91,8 +104,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self._clock = [0]
         self.stale_updates = 0
         self._unreturned, self._warned = 0, False
-        if (batch_size := kwargs.get("batch_size")) is not None:
-            kwargs["batch_size"] = check_counts(batch_size=batch_size)
+        if batch_size is not None:
+            batch_size = check_counts(batch_size=batch_size)
         if (prefetch := kwargs.get("prefetch")) not in (None, 0):
             raise ValueError(
                 f"prefetch must be None, got {prefetch!r}: a batch that is sampled ahead knows "
@@ -101,8 +114,17 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         if not isinstance(generator, torch.Generator | None):
             raise TypeError(f"generator must be a torch.Generator, got {generator!r}")
         # TorchRL sets it once the parts are made, which have to agree with it.
-        self.priority_key = kwargs.get("priority_key", "td_error")
-        super().__init__(generator=generator or seeded_generator(), **kwargs)
+        self.priority_key = priority_key
+        super().__init__(
+            storage=storage,
+            sampler=sampler,
+            writer=writer,
+            transform=transform,
+            batch_size=batch_size,
+            priority_key=priority_key,
+            generator=generator or seeded_generator(),
+            **kwargs,
+        )
 
     def _initialize_prioritized_sampler(self) -> None:
         # As long as TorchRL can still undo what it has made: it may have put that off to this use.

@@ -30,16 +30,15 @@ Shapes: ``N`` transitions in the buffer, ``B`` in a batch, ``K`` signals.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import Level
-from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, Rule, check, check_finite, keep
+from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, Rule, check, check_finite, keep
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -170,15 +169,41 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
     return torch.mv(signals, weights) + eps
 
 
-@runtime_checkable
-class Fusion(Protocol):
+class Fusion:
     """One weight for each signal, computed from the buffer.
 
-    A user's own fusion is any object with this method; it may keep state. The sampler asks for
-    weights when enough of the buffer was rewritten, or, if the fusion has an attribute
-    ``every_batch`` that is true, at every update. If it has an attribute ``signal_names``, the
-    sampler rejects one that it does not fuse.
+    A fusion of your own is a subclass with its :meth:`weights`; it may keep state. The sampler asks
+    for weights when enough of the buffer was rewritten.
+
+    Examples:
+        >>> class Equal(Fusion):
+        ...     def weights(self, names, table, index):
+        ...         return torch.ones(len(names))
+        >>> Equal().every_batch
+        False
     """
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Signals that the sampler must fuse."""
+        return ()
+
+    @property
+    def every_batch(self) -> bool:
+        """True if the weights hold for one batch alone: they are asked for at every update."""
+        return False
+
+    @property
+    def uses_level(self) -> bool:
+        """True if the weights depend on ``table.positive_above``."""
+        return False
+
+    def anneal(self, fraction: float) -> None:
+        """Move to a share of the training that is done, from 0 to 1; by default nothing moves."""
+
+    def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor | None:
+        """Return the entropy of each signal, shape ``[K]``, for statistics; None where none is."""
+        return None
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Weigh the signals.
@@ -191,16 +216,7 @@ class Fusion(Protocol):
         Returns:
             One weight a signal, in the order of ``names``, shape ``[K]``.
         """
-        ...
-
-
-@runtime_checkable
-class Annealed(Protocol):
-    """A part with a schedule over the training."""
-
-    def anneal(self, fraction: float) -> None:
-        """Move to a share of the training that is done, from 0 to 1."""
-        ...
+        raise NotImplementedError(f"{type(self).__name__} must have a method weights()")
 
 
 def checked_weights(
@@ -215,7 +231,7 @@ def checked_weights(
 
 
 @dataclass(frozen=True)
-class EntropyFusion:
+class EntropyFusion(Fusion):
     r"""Weights by information entropy, Eqs. (16)-(20).
 
     Args:
@@ -225,16 +241,11 @@ class EntropyFusion:
             action gradient are equal by definition.
         population: Transitions that the probabilities are counted over: the whole ``"buffer"``
             (default), or the ``"batch"``, which prioritized sampling biases.
-        positive_above: See :func:`positive_entropy`. With ``"mean"`` both events are one, hence all
-            weights equal for any data.
         floor: Smallest weight a signal may get before the weights are normalized again; 0 is the
             paper, whose TD weight vanishes once all rewards are positive.
 
     Raises:
         ValueError: If an argument is out of its range.
-
-    Warns:
-        UserWarning: If ``positive_above`` is ``"mean"``.
 
     Examples:
         >>> EntropyFusion().population
@@ -243,7 +254,6 @@ class EntropyFusion:
 
     reward_signals: Sequence[str] | None = None
     population: Literal["buffer", "batch"] = "buffer"
-    positive_above: Level = 0.0
     floor: float = 0.0
 
     def __post_init__(self) -> None:
@@ -251,14 +261,7 @@ class EntropyFusion:
         if isinstance(names, str) or not isinstance(names, Sequence | None):
             raise TypeError(f"reward_signals must be names, got {self.reward_signals!r}")
         population: Rule = (lambda word: word in ("buffer", "batch"), "'buffer' or 'batch'")
-        keep(self, positive_above=LEVEL, floor=BELOW_ONE, population=population)
-        if self.positive_above == "mean":
-            warnings.warn(
-                "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
-                "all signals get equal weights for any data. With a number between the "
-                "rewards the weights follow the data",
-                stacklevel=3,
-            )
+        keep(self, floor=BELOW_ONE, population=population)
 
     @property
     def signal_names(self) -> tuple[str, ...]:
@@ -270,11 +273,16 @@ class EntropyFusion:
         """Weights that are counted over a batch hold for that batch alone."""
         return self.population == "batch"
 
+    @property
+    def uses_level(self) -> bool:
+        """Eq. (17) counts positive transitions."""
+        return True
+
     def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return the entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""
         rewards = table.rewards if self.population == "buffer" else table.rewards[index]
         of_reward = reward_entropy(rewards)
-        of_positive = positive_entropy(rewards, positive_above=self.positive_above)
+        of_positive = positive_entropy(rewards, positive_above=table.positive_above)
         by_reward = ("reward",) if self.reward_signals is None else self.reward_signals
         return torch.stack([of_reward if name in by_reward else of_positive for name in names])
 
@@ -288,7 +296,7 @@ class EntropyFusion:
 
 
 @dataclass(frozen=True)
-class FixedFusion:
+class FixedFusion(Fusion):
     """Weights that never change; one signal of weight one is plain PER.
 
     Args:
@@ -324,7 +332,7 @@ class FixedFusion:
 
 
 @dataclass(frozen=True)
-class ScaledFusion:
+class ScaledFusion(Fusion):
     """Weights of another fusion for signals that are first divided by their mean in the buffer.
 
     Signals of different units then have the shares in a priority that their weights say.
@@ -341,22 +349,26 @@ class ScaledFusion:
 
     def __post_init__(self) -> None:
         if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must have a method 'weights', got {self.fusion!r}")
+            raise TypeError(f"fusion must be a Fusion, got {self.fusion!r}")
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """As the other fusion."""
-        return tuple(getattr(self.fusion, "signal_names", ()))
+        return self.fusion.signal_names
 
     @property
     def every_batch(self) -> bool:
         """As the other fusion."""
-        return bool(getattr(self.fusion, "every_batch", False))
+        return self.fusion.every_batch
+
+    @property
+    def uses_level(self) -> bool:
+        """As the other fusion."""
+        return self.fusion.uses_level
 
     def anneal(self, fraction: float) -> None:
-        """Move the other fusion, if it has a schedule."""
-        if isinstance(self.fusion, Annealed):
-            self.fusion.anneal(fraction)
+        """Move the other fusion."""
+        self.fusion.anneal(fraction)
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return weights divided by the means of the signals, shape ``[K]``."""

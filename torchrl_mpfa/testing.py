@@ -24,9 +24,9 @@ import torch
 from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting, counts_buffer
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.buffer import SignalReplayBuffer
-from torchrl_mpfa.fusion import Annealed, Fusion
+from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.signals import Signal
@@ -52,18 +52,22 @@ def check_adjustment(adjustment: Adjustment) -> None:
     Examples:
         >>> from torchrl_mpfa import PositiveBoost
         >>> check_adjustment(PositiveBoost(boost=2.0))
-        >>> check_adjustment(lambda priority, batch: -priority)
+        >>> class Wrong(PositiveBoost):
+        ...     def __call__(self, priority, batch):
+        ...         return -priority
+        >>> check_adjustment(Wrong())
         Traceback (most recent call last):
             ...
         AssertionError: adjusted priorities must be finite and not negative, got -...
     """
+    _require(isinstance(adjustment, Adjustment), "an adjustment must be a torchrl_mpfa.Adjustment")
     generator = torch.Generator().manual_seed(0)
     for count in (1, 2, 64):
         priority = torch.rand(count, generator=generator, dtype=torch.double) * 5 + 0.01
         reward = torch.randn(count, generator=generator, dtype=torch.double) * 3
         replays = torch.randint(1, 50, (count,), generator=generator).double()
-        facts = BatchFacts(reward, replays, torch.arange(count), mean_reward=float(reward.mean()))
-        if counts_buffer(adjustment) and isinstance(adjustment, Counting):
+        facts = BatchFacts(reward, replays, torch.arange(count), level=float(reward.mean()))
+        if adjustment.counts:
             table = _table(("reward", "td_error"), scale=1.0, offset=0.0)
             known = table.rows[: table.size, : len(table.names)].sum(1)
             facts = replace(facts, counted=adjustment.count(table, known))
@@ -101,10 +105,9 @@ def check_fusion(
         >>> from torchrl_mpfa import EntropyFusion
         >>> check_fusion(EntropyFusion())
     """
-    _require(isinstance(fusion, Fusion), "a fusion must have a method 'weights'")
-    for fraction in (0.0, 0.5, 1.0) if isinstance(fusion, Annealed) else (None,):
-        if isinstance(fusion, Annealed) and fraction is not None:
-            fusion.anneal(fraction)
+    _require(isinstance(fusion, Fusion), "a fusion must be a torchrl_mpfa.Fusion")
+    for fraction in (0.0, 0.5, 1.0):
+        fusion.anneal(fraction)
         for scale, offset in ((1.0, 0.0), (1.0, 9.0), (1.0, -9.0), (0.0, 0.0)):
             table = _table(signals, scale=scale, offset=offset)
             _check_weights(fusion, table, torch.arange(0, table.size, 3))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer, make_transitions, set_signals
-from torchrl_mpfa import FixedFusion, ScaledFusion
+from torchrl_mpfa import Adjustment, FixedFusion, ScaledFusion
 from torchrl_mpfa.methods.mw import MWSampler
 
 SIGNALS = ["reward", "td_error"]
@@ -72,8 +72,12 @@ def test_transition_that_takes_the_place_of_a_spent_one_counts_again():
 
 
 def test_update_that_raises_uses_no_transition_up():
+    class Broken(Adjustment):
+        def __call__(self, priority, batch):
+            return priority * torch.nan
+
     buffer = make_capped(6, 4, 1)
-    buffer.sampler.adjustments = (lambda priority, batch: priority * torch.nan,)
+    buffer.sampler.adjustments = (Broken(),)
     with pytest.raises(ValueError, match="adjusted priorities must be finite"):
         train(buffer)
     assert not buffer.sampler._spent.any()

@@ -6,13 +6,13 @@ from tensordict import TensorDict
 
 from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
 from tests.mpfa.transitions import restore
-from torchrl_mpfa import PositiveBoost, SignalSampler
+from torchrl_mpfa import Adjustment, PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.testing import check_adjustment
 
 
-class Census:
+class Census(Adjustment):
     """Counts how often it was asked, and keeps what it was told."""
 
     counts = True
@@ -136,9 +136,16 @@ def phi_by_hand(rewards, level, target, highest):
 @pytest.mark.parametrize("level", [0.0, 1.0, 9.0])
 def test_the_rarer_positive_transitions_are_the_larger_is_phi(level):
     rewards = torch.randn(40, generator=seeded(2))
-    boost = PositiveBoost(boost=6.0, positive_above=level, target_share=0.4)
+    boost = PositiveBoost(boost=6.0, target_share=0.4)
     sampler = SignalSampler(
-        40, 0.6, 0.4, 0.0, signals=["td_error"], adjustments=[boost], entropy_refresh=0
+        40,
+        0.6,
+        0.4,
+        0.0,
+        signals=["td_error"],
+        adjustments=[boost],
+        positive_above=level,
+        entropy_refresh=0,
     )
     buffer = make_buffer(sampler, 40, 8, filled=0)
     buffer.extend(TensorDict({"next": {"reward": rewards.unsqueeze(1)}}, [40]))

@@ -19,6 +19,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import (
+    Adjustment,
     MPFASampler,
     SignalReplayBuffer,
     SignalSliceSampler,
@@ -108,14 +109,15 @@ def test_a_buffer_and_storage_of_ours_need_no_warning():
 def test_a_rejected_update_changes_nothing_at_all():
     """Not even the weights, which were counted before an adjustment failed."""
 
-    def broken(priority, batch):
-        return priority * torch.nan
+    class Broken(Adjustment):
+        def __call__(self, priority, batch):
+            return priority * torch.nan
 
     buffer = make_filled(8, entropy_refresh=0)
     train_rounds(buffer, 2)
     batch = write_signals(buffer.sample())
     buffer.extend(make_transitions(2, seed=5))
-    buffer.sampler.adjustments = (broken,)
+    buffer.sampler.adjustments = (Broken(),)
     with rejected(buffer, ValueError, "adjusted priorities must be finite"):
         buffer.update_tensordict_priority(batch)
 

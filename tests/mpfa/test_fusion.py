@@ -68,7 +68,6 @@ def test_ties_count_as_not_greater():
     assert float(reward_entropy(torch.zeros(4))) == 0.0
 
 
-@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_positive_may_mean_above_a_level_or_above_the_mean():
     """Pendulum: all rewards are negative, so that none is positive by the letter."""
     rewards = torch.tensor([-8.0, -6.0, -1.0, -0.5])
@@ -77,7 +76,8 @@ def test_positive_may_mean_above_a_level_or_above_the_mean():
     assert float(positive_entropy(rewards, positive_above="mean")) == 1.0
     table, index = make_table(rewards.tolist()), torch.arange(4)
     assert EntropyFusion().weights(NAMES, table, index).tolist() == [0.0, 0.0, 1.0]
-    cured = EntropyFusion(positive_above="mean").weights(NAMES, table, index)
+    table.positive_above = "mean"
+    cured = EntropyFusion().weights(NAMES, table, index)
     assert cured.tolist() == pytest.approx([1 / 3] * 3)
 
 

@@ -4,7 +4,6 @@ import pytest
 
 from tests.mpfa.transitions import make_filled, train_rounds
 from torchrl_mpfa import FixedFusion, Fusion, ScaledFusion
-from torchrl_mpfa.fusion import Annealed
 from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.samplers.table import SignalTable
 
@@ -29,7 +28,6 @@ def test_scheduled_weights_go_in_a_line_from_start_to_end():
         found.append(fusion.weights(NAMES, None, None).tolist())
     assert found == [pytest.approx(w) for w in ([1.0, 0.0], [0.8, 0.2], [0.2, 0.8])]
     assert isinstance(fusion, Fusion)
-    assert isinstance(fusion, Annealed)
 
 
 def test_scaled_signals_have_the_shares_that_their_weights_say():

@@ -17,8 +17,8 @@ from torchrl_mpfa import (
     FixedFusion,
     MPFASampler,
     PositiveBoost,
-    PositiveDecay,
     ScaledFusion,
+    SignalTensorStorage,
 )
 from torchrl_mpfa.methods import make_replay
 
@@ -69,7 +69,7 @@ def test_the_cure_gives_every_signal_its_weight(level):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: EntropyFusion(positive_above="mean"),
+        lambda: MPFASampler(8, fusion=ScaledFusion(EntropyFusion()), positive_above="mean"),
         lambda: MPFASampler(8, positive_above="mean"),
         lambda: make_replay("mpfa_per", capacity=8, positive_above="mean"),
     ],
@@ -90,17 +90,19 @@ def test_own_weights_with_the_mean_cause_no_warning():
 @pytest.mark.parametrize("population", ["buffer", "batch"])
 def test_the_mean_as_level_does_make_all_weights_equal(share, population):
     rewards = torch.rand(400, generator=seeded(1)) - share
-    fusion = EntropyFusion(positive_above="mean", population=population)
-    buffer = make_buffer(400, 64, fusion=fusion, entropy_refresh=0)
+    fusion = EntropyFusion(population=population)
+    buffer = make_buffer(400, 64, fusion=fusion, positive_above="mean", entropy_refresh=0)
     buffer.extend(make_transitions(400, rewards=rewards))
     train_rounds(buffer, 2)
     assert [*buffer.sampler.weights.values()] == [1 / 3] * 3
 
 
 def test_the_mean_of_the_buffer_reaches_the_boost():
-    boost = PositiveBoost(boost=2.0, bound="none", positive_above="mean")
-    fusion = FixedFusion({"td_error": 1.0})
-    buffer = make_buffer(4, adjustments=[boost], fusion=fusion, eps=0.0)
+    parts = {
+        "adjustments": [PositiveBoost(boost=2.0, bound="none")],
+        "fusion": FixedFusion({"td_error": 1.0}),
+    }
+    buffer = make_buffer(4, positive_above="mean", eps=0.0, **parts)
     buffer.extend(make_transitions(4, rewards=[-1.0, -3.0, -5.0, -7.0]))
     batch = buffer[torch.arange(4)]
     batch["index"] = torch.arange(4)
@@ -109,17 +111,11 @@ def test_the_mean_of_the_buffer_reaches_the_boost():
     assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0]
 
 
-@pytest.mark.filterwarnings("ignore:positive_above='mean'")
-def test_one_argument_reaches_entropy_boost_and_decay():
-    sampler = MPFASampler(8, positive_above="mean")
-    assert sampler.fusion == EntropyFusion(positive_above="mean")
-    assert sampler.adjustments == (
-        PositiveBoost(positive_above="mean"),
-        PositiveDecay(positive_above="mean"),
-    )
+def test_the_level_of_a_method_is_that_of_its_sampler_also_after_a_change_of_capacity():
     sampler = make_replay("mpfa_per", capacity=8, positive_above=-2).buffer.sampler
-    found = {part.positive_above for part in (sampler.fusion, *sampler.adjustments)}
-    assert found == {-2}
+    assert (sampler.positive_above, sampler.table.positive_above) == (-2, -2)
+    buffer = make_buffer(None, storage=SignalTensorStorage(16), positive_above=-3.0)
+    assert (buffer.sampler.max_size, buffer.sampler.table.positive_above) == (16, -3.0)
 
 
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")

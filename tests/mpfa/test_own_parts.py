@@ -8,7 +8,9 @@ from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same
 from torchrl_mpfa import (
     REWARD,
     TD_ERROR,
+    Adjustment,
     FixedFusion,
+    Fusion,
     Signal,
     SignalSampler,
 )
@@ -17,7 +19,7 @@ NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
 SURPRISE = Signal("surprise", key="surprise", known_at="write", priority=torch.square)
 
 
-class LoudestSignal:
+class LoudestSignal(Fusion):
     """All weight to the signal whose known values have the highest mean."""
 
     def weights(self, names, table, index):
@@ -26,7 +28,7 @@ class LoudestSignal:
         return torch.nn.functional.one_hot(means.argmax(), len(names)).float()
 
 
-class CappedReplays:
+class CappedReplays(Adjustment):
     """Transitions that were replayed often enough are set aside."""
 
     def __init__(self, limit):
@@ -128,7 +130,7 @@ def test_an_own_fusion_and_an_own_adjustment_do_their_work():
 
 @pytest.mark.parametrize("weights", [torch.ones(2), torch.ones(4, 1), torch.ones(())])
 def test_an_own_fusion_of_the_wrong_shape_is_rejected(weights):
-    class Wrong:
+    class Wrong(Fusion):
         def weights(self, names, table, index):
             return weights
 
@@ -140,15 +142,19 @@ def test_an_own_fusion_of_the_wrong_shape_is_rejected(weights):
 
 @pytest.mark.parametrize("wrong", [-1.0, torch.nan, torch.inf])
 def test_wrong_weights_and_wrong_adjusted_priorities_are_rejected(wrong):
-    class Wrong:
+    class WrongWeights(Fusion):
         def weights(self, names, table, index):
             return torch.tensor([wrong, 1.0, 1.0, 1.0])
 
-    buffer = make_own_buffer(fusion=Wrong())
+    class WrongPriority(Adjustment):
+        def __call__(self, priority, batch):
+            return priority * wrong
+
+    buffer = make_own_buffer(fusion=WrongWeights())
     buffer.extend(make_own_transitions(8))
     with pytest.raises(ValueError, match="weights of the fusion must be finite"):
         update(buffer, [2], td_error=[4.0], novelty=[2.0])
-    buffer = make_own_buffer(adjustments=[lambda priority, batch: priority * wrong])
+    buffer = make_own_buffer(adjustments=[WrongPriority()])
     buffer.extend(make_own_transitions(8))
     before = priorities(buffer)
     with pytest.raises(ValueError, match="adjusted priorities must be finite and not negative"):

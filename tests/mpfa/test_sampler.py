@@ -20,6 +20,7 @@ from tests.mpfa.transitions import (
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,
+    Fusion,
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
@@ -206,7 +207,7 @@ def test_replays_are_counted_with_duplicates_and_start_again_with_a_new_transiti
     assert counts[1:].sum() == (index > 0).sum()
 
 
-class CountingFusion:
+class CountingFusion(Fusion):
     """Equal weights, and how often they were asked for."""
 
     def __init__(self):

@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from torchrl_mpfa import (
+    Adjustment,
     EntropyFusion,
     FixedFusion,
+    Fusion,
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
@@ -30,10 +32,10 @@ from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
     "adjustment",
     [
         PositiveBoost(),
-        PositiveBoost(bound="cap", positive_above="mean"),
+        PositiveBoost(bound="cap"),
         PositiveDecay(),
         PositiveDecay(position="rank"),
-        PositiveDecay(position="count", positive_above=1.0),
+        PositiveDecay(position="count"),
         LAPFloor(1.0),
         HVPERPenalty(),
     ],
@@ -47,7 +49,7 @@ def test_our_adjustments_pass(adjustment):
     [
         (EntropyFusion(), ["reward", "td_error", "action_gradient"]),
         (EntropyFusion(population="batch", floor=0.1), ["reward", "novelty"]),
-        (EntropyFusion(positive_above=0.5), ["td_error", "action_gradient"]),
+        (EntropyFusion(), ["td_error", "action_gradient"]),
         (FixedFusion({"td_error": 1.0}), ["reward", "td_error"]),
         (ScaledFusion(FixedFusion({"reward": 1.0, "td_error": 1.0})), ["reward", "td_error"]),
         (ScheduledFusion({"reward": 1.0}, {"td_error": 1.0}), ["reward", "td_error"]),
@@ -87,11 +89,17 @@ def test_our_samplers_pass(make):
     ],
 )
 def test_broken_adjustments_are_caught(broken, message):
+    class Broken(Adjustment):
+        def __call__(self, priority, batch):
+            return broken(priority, batch)
+
     with pytest.raises(AssertionError, match=message):
+        check_adjustment(Broken())
+    with pytest.raises(AssertionError, match=r"must be a torchrl_mpfa\.Adjustment"):
         check_adjustment(broken)
 
 
-class Broken:
+class Broken(Fusion):
     def __init__(self, weigh):
         self.weights = weigh
 
@@ -119,7 +127,7 @@ def scribble(names, table, index):
 def test_broken_fusions_are_caught(weigh, message):
     with pytest.raises(AssertionError, match=message):
         check_fusion(Broken(weigh))
-    with pytest.raises(AssertionError, match="must have a method 'weights'"):
+    with pytest.raises(AssertionError, match=r"must be a torchrl_mpfa\.Fusion"):
         check_fusion(object())
 
 

@@ -77,6 +77,14 @@ class Method:
     needs_actor: ClassVar[bool] = False
     """True if the method is only for learners with an actor."""
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if hasattr(cls, "kept_signals"):
+            raise TypeError(
+                f"{cls.__name__}.kept_signals() is not called since 0.5: name the signals in KEPT, "
+                "an attribute of the sampler's class"
+            )
+
     def __post_init__(self) -> None:
         keep(self, **rules_of(type(self)))
 
@@ -167,6 +175,11 @@ class Prioritized(Method):
     stratified: bool = within(SWITCH, False)
     """True: a batch has one transition from each of equal parts of the total priority."""
 
+    @property
+    def positive_above(self) -> Any:
+        """Reward above which a transition is positive, for fusion and adjustments."""
+        return 0.0
+
     def beta_at(self, fraction: float) -> float:
         """Return the importance exponent after a part of the training (Eq. 10)."""
         return self.beta + (self.beta_end - self.beta) * fraction
@@ -201,6 +214,7 @@ class Prioritized(Method):
             signals=self.priority_signals(),
             fusion=self.fusion(),
             adjustments=self.adjustments(),
+            positive_above=self.positive_above,
             **self.sampler_options(),
         )
         return made

@@ -14,15 +14,15 @@ to [0, 1] within a batch, the schedule of the weights and the penalty on replays
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check, keep
-from torchrl_mpfa.fusion import FixedFusion
+from torchrl_mpfa.fusion import FixedFusion, Fusion
 from torchrl_mpfa.signals import Signal
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ RELATIVE_ERROR = Signal("relative_td_error", key=("signals", "td_error"), priori
 
 
 @dataclass
-class ScheduledFusion:
+class ScheduledFusion(Fusion):
     """Weights that are interpolated linearly from one set to another over the training.
 
     Args:
@@ -90,7 +90,6 @@ class ScheduledFusion:
 
     start: dict[str, float]
     end: dict[str, float]
-    every_batch: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         self._ends = FixedFusion(self.start), FixedFusion(self.end)
@@ -101,6 +100,11 @@ class ScheduledFusion:
     def signal_names(self) -> tuple[str, ...]:
         """Signals that must be fused."""
         return tuple(dict.fromkeys((*self.start, *self.end)))
+
+    @property
+    def every_batch(self) -> bool:
+        """Weights follow the training."""
+        return True
 
     def anneal(self, fraction: float) -> None:
         """Move to a share of the training that is done, from 0 to 1.
@@ -138,7 +142,7 @@ def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
 
 
 @dataclass(frozen=True)
-class HVPERPenalty:
+class HVPERPenalty(Adjustment):
     r"""Lower priorities of often replayed transitions, :math:`\max(p_i - \kappa U_i, \epsilon)`.
 
     ``U`` is the number of replays as a share of the largest one in the batch.

@@ -12,12 +12,12 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.checks import POSITIVE, keep
 
 
 @dataclass(frozen=True)
-class LAPFloor:
+class LAPFloor(Adjustment):
     r"""Raise priorities to a floor, :math:`\max(|\delta_i|, 1)`.
 
     Args:

@@ -57,7 +57,6 @@ class Adjusted(Prioritized):
             boost = PositiveBoost(
                 boost=self.boost_factor,
                 bound=self.boost_bound,  # type: ignore[arg-type]
-                positive_above=self.positive_above,
                 target_share=self.boost_target,
             )
             made.append(boost)
@@ -65,7 +64,6 @@ class Adjusted(Prioritized):
             decay = PositiveDecay(
                 sharpness=self.decay_sharpness,
                 position=self.decay_position,  # type: ignore[arg-type]
-                positive_above=self.positive_above,
             )
             made.append(decay)
         return made
@@ -91,7 +89,6 @@ class MPFA(Adjusted):
 
         return EntropyFusion(
             population=self.population,  # type: ignore[arg-type]
-            positive_above=self.positive_above,
             floor=self.weight_floor,
         )
 

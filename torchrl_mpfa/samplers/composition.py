@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import PositiveBoost, is_positive, level_of
+from torchrl_mpfa.adjustment import PositiveBoost
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.fused import SignalSampler, Weighing
+
+_ENOUGH = 1000
+"""With fewer rewards there is no warning that all are on one side."""
 
 
 def composition(
@@ -27,16 +30,14 @@ def composition(
             found.setdefault("boost_factor", float(factor))
     if table.size == 0:
         return found
-    level, mean = level_of((*sampler.adjustments, sampler.fusion)), float(table.rewards.mean())
-    positive = is_positive(table.rewards, level, mean=mean)
-    found["positive_fraction_buffer"] = float(positive.double().mean())
+    level = table.level
+    found["positive_fraction_buffer"] = float((table.rewards > level).double().mean())
     if batch is None:
         return found
     index, importance = batch
     rows = table.rows[index]
-    if (entropies := getattr(sampler.fusion, "entropies", None)) is not None:
-        values = entropies(names, table, index).tolist()
-        found |= {f"entropy/{n}": v for n, v in zip(names, values, strict=True)}
+    if (entropies := sampler.fusion.entropies(names, table, index)) is not None:
+        found |= {f"entropy/{n}": v for n, v in zip(names, entropies.tolist(), strict=True)}
     known = rows[:, table.fused]
     known = known[~known.isnan().any(1)]
     if weights and len(known):
@@ -45,7 +46,7 @@ def composition(
         parts = known.mean(0) * ordered.to(known.device)
         shares = parts / parts.sum() if parts.sum() > 0 else torch.full_like(parts, 1 / len(parts))
         found |= {f"share/{n}": v for n, v in zip(names, shares.tolist(), strict=True)}
-    positive = is_positive(rows[:, table.reward_column], level, mean=mean)
+    positive = rows[:, table.reward_column] > level
     age = table.writes - 1 - rows[:, table.time_column]
     return {
         **found,
@@ -55,3 +56,25 @@ def composition(
         "sampled_age_max": float(age.max()),
         "replay_count_mean": float(rows[:, table.count_column].mean()),
     }
+
+
+def one_sided(sampler: SignalSampler) -> str | None:
+    """Return a warning if all rewards of a buffer are on one side of the level of a sampler.
+
+    There is none for few rewards, nor for rewards that are all equal, which no level separates.
+    """
+    level, rewards = sampler.positive_above, sampler.table.rewards
+    used = sampler.fusion.uses_level or any(part.uses_level for part in sampler.adjustments)
+    if level == "mean" or not used or len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
+        return None
+    above = int((rewards > level).sum())
+    # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
+    waits = above == 0 and level > 0 and not sampler.fusion.uses_level
+    if waits or 0 < above < len(rewards):
+        return None
+    return (
+        f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
+        f"above {level}: by Eq. (17) TD error and gradient get no weight next to the "
+        "reward, and boost and decay separate no transitions. Set positive_above to a "
+        "level between the rewards, or to 'mean', with which all weights are equal"
+    )

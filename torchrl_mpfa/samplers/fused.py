@@ -12,13 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.adjustment import (
-    Adjustment,
-    BatchFacts,
-    counts_buffer,
-    one_sided,
-)
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level
 from torchrl_mpfa.checks import (
+    LEVEL,
     NOT_NEGATIVE,
     check,
     check_counts,
@@ -26,8 +22,8 @@ from torchrl_mpfa.checks import (
     check_index,
     unknown,
 )
-from torchrl_mpfa.fusion import Annealed, FixedFusion, Fusion, checked_weights, fuse
-from torchrl_mpfa.samplers.composition import composition
+from torchrl_mpfa.fusion import FixedFusion, Fusion, checked_weights, fuse
+from torchrl_mpfa.samplers.composition import composition, one_sided
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.table import SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
@@ -67,23 +63,35 @@ class SignalSampler(TreeSampler):
 
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
 
-    Further arguments, in their order: see :class:`~torchrl_mpfa.samplers.TreeSampler`, from
-    ``max_capacity`` to ``stratified``. ``eps`` is added once, before the adjustments.
-
     Args:
-        *args: Further arguments.
+        max_capacity: As in :class:`~torchrl_mpfa.samplers.TreeSampler`, and so all that follow but
+            for these.
+        alpha: Priority exponent :math:`\alpha` of Eq. (8).
+        beta: Importance exponent :math:`\beta` of Eq. (10).
+        eps: :math:`\epsilon` of Eq. (21), added once, before the adjustments.
+        dtype: Type of the importance weights.
+        reduction: As in TorchRL.
+        max_priority_within_buffer: Highest priority that a fresh transition gets.
+        device: Device of priorities and sampled slots.
+        stratified: True to sample one slot from each of ``B`` parts.
         signals: The signals to fuse, as objects or names.
         fusion: Weights of the signals, see :class:`~torchrl_mpfa.Fusion`; by default equal ones.
-        adjustments: Changes of the fused priorities, in order.
+        adjustments: Changes of the fused priorities, see :class:`~torchrl_mpfa.Adjustment`, in
+            order.
+        positive_above: A transition is positive when its reward is above this: a number (0 in the
+            paper), or ``"mean"``, the mean reward of the buffer. Fusion and adjustments use it.
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, for any capacity.
         reward_key: Where the signed reward of a transition is read.
-        **kwargs: Further arguments.
 
     Raises:
+        TypeError: If fusion or adjustments are of other types.
         ValueError: If an argument is out of its range, or the fusion names a signal that is not
             among the ``signals``.
+
+    Warns:
+        UserWarning: If ``positive_above`` is ``"mean"`` and the fusion counts entropies.
 
     Examples:
         >>> sampler = SignalSampler(1000, 0.6, 0.4, signals=["td_error"])
@@ -97,33 +105,61 @@ class SignalSampler(TreeSampler):
 
     def __init__(
         self,
-        *args: Any,
+        max_capacity: int | None,
+        alpha: float,
+        beta: float,
+        eps: float = 1e-8,
+        dtype: torch.dtype = torch.float,
+        reduction: str = "max",
+        max_priority_within_buffer: bool = False,
+        device: torch.device | str | None = None,
+        *,
+        stratified: bool = False,
         signals: Sequence[Signal | str] = ("td_error",),
         fusion: Fusion | None = None,
         adjustments: Sequence[Adjustment] = (),
+        positive_above: Level = 0.0,
         entropy_refresh: float = 1 / 256,
         reward_key: NestedKey = ("next", "reward"),
-        **kwargs: Any,
     ) -> None:
         self.signals = as_signals(signals)
-        self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
-        if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must have a method 'weights', got {type(fusion).__name__}")
         fused = [signal.name for signal in self.signals]
-        for name in getattr(self.fusion, "signal_names", ()):
+        self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
+        if not isinstance(self.fusion, Fusion):
+            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {type(fusion).__name__}")
+        for name in self.fusion.signal_names:
             if name not in fused:
                 raise ValueError(unknown("signal of the fusion", name, fused))
         self.adjustments = tuple(adjustments)
         for adjust in self.adjustments:
-            if not callable(adjust):
-                raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
+            if not isinstance(adjust, Adjustment):
+                kind = type(adjust).__name__
+                raise TypeError(f"adjustments must be torchrl_mpfa.Adjustment, got {kind}")
+        self.positive_above: Level = check(LEVEL, positive_above=positive_above)
+        if self.positive_above == "mean" and self.fusion.uses_level:
+            warnings.warn(
+                "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
+                "all signals get equal weights for any data. With a number between the "
+                "rewards the weights follow the data",
+                stacklevel=2,
+            )
         self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
-        self._counting = [counts_buffer(each) for each in self.adjustments]
+        self._counting = [adjust.counts for adjust in self.adjustments]
         self.reward_key = reward_key
         self._warned: set[str] = set()
         self._read: Tensor | None = None
         self._attached = False
-        super().__init__(*args, **kwargs)
+        super().__init__(
+            max_capacity,
+            alpha,
+            beta,
+            eps,
+            dtype,
+            reduction,
+            max_priority_within_buffer,
+            device,
+            stratified=stratified,
+        )
         self.table = self._empty_table()
         """Signals, reward, replay count and time of writing of every slot."""
         self._names = self.table.names[self.table.fused]
@@ -134,6 +170,7 @@ class SignalSampler(TreeSampler):
             self.signals,
             kept=[signal for signal in self.KEPT if signal not in self.signals],
             reward_key=self.reward_key,
+            positive_above=self.positive_above,
             device=self.device,
         )
 
@@ -151,8 +188,7 @@ class SignalSampler(TreeSampler):
 
     def anneal(self, fraction: float) -> None:
         """Move a fusion with a schedule to a share of the training that is done, from 0 to 1."""
-        if isinstance(self.fusion, Annealed):
-            self.fusion.anneal(fraction)
+        self.fusion.anneal(fraction)
 
     def _resize(self, capacity: int) -> None:
         super()._resize(capacity)
@@ -311,12 +347,9 @@ class SignalSampler(TreeSampler):
     def _takes_batches(self) -> bool:
         """Return True if equal batches can be fused and adjusted in one call."""
         # Nothing may be counted again between two batches.
-        counts = any(self._counting) or getattr(self.fusion, "every_batch", False)
-        if counts or self.entropy_refresh == 0:
+        if any(self._counting) or self.fusion.every_batch or self.entropy_refresh == 0:
             return False
-        # Said by the class itself: a subclass may have a method that takes one batch.
-        said = [vars(type(each)).get("takes_batches", False) for each in self.adjustments]
-        return all(said)
+        return all(adjust.takes_batches for adjust in self.adjustments)
 
     def _fused(
         self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing, batches: int
@@ -328,7 +361,7 @@ class SignalSampler(TreeSampler):
             reward=rows.select(1, table.reward_column).view(shape),
             replay_count=rows.select(1, table.count_column).view(shape),
             index=(slots := slots.view(shape)),
-            mean_reward=weighing.mean_reward,
+            level=weighing.mean_reward if self.positive_above == "mean" else self.positive_above,
             written_at=rows.select(1, table.time_column).view(shape),
         )
         for place, adjust in enumerate(self.adjustments):
@@ -354,11 +387,11 @@ class SignalSampler(TreeSampler):
                 checked_weights(self.fusion, self._names, table, index),
                 table.rewards,
             )
-            if (text := one_sided(rewards, (self.fusion, *self.adjustments))) is not None:
+            if (text := one_sided(self)) is not None:
                 self._warn_once(text)
             mean, before = float(rewards.mean()), last or Weighing()
             made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
-        elif getattr(self.fusion, "every_batch", False):
+        elif self.fusion.every_batch:
             made = replace(last, weights=checked_weights(self.fusion, self._names, table, index))
         else:
             made = last
@@ -371,7 +404,7 @@ class SignalSampler(TreeSampler):
             return replace(last, learned_since=last.learned_since + learned)
         fused = self._combined(table.rows[: table.size], last)
         counted = [
-            each.count(table, fused) if counts else None  # type: ignore[attr-defined]
+            each.count(table, fused) if counts else None
             for each, counts in zip(self.adjustments, self._counting, strict=True)
         ]
         for value in counted:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
-from torchrl_mpfa.adjustment import Level, PositiveBoost, PositiveDecay
-from torchrl_mpfa.checks import LEVEL, check
-from torchrl_mpfa.fusion import EntropyFusion
+import torch
+from tensordict.utils import NestedKey
+
+from torchrl_mpfa.adjustment import Adjustment, Level, PositiveBoost, PositiveDecay
+from torchrl_mpfa.fusion import EntropyFusion, Fusion
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.signals import MPFA_SIGNALS
+from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 
 
 class MPFASampler(SignalSampler):
@@ -24,28 +26,34 @@ class MPFASampler(SignalSampler):
         alpha: Priority exponent :math:`\alpha` of Eq. (8).
         beta: Importance exponent :math:`\beta` of Eq. (10), to be raised to 1 over the training.
         eps: :math:`\epsilon` of Eq. (21).
-        *args: The further arguments of :class:`SignalSampler`, in its order.
+        dtype: Type of the importance weights.
+        reduction: As in TorchRL.
+        max_priority_within_buffer: True: fresh transitions get the highest priority in the buffer.
+        device: Device of priorities and sampled slots; by default that of the storage.
+        stratified: True to sample one slot from each of ``B`` parts.
+        signals: By default the paper's three.
+        fusion: By default :class:`~torchrl_mpfa.EntropyFusion`.
+        adjustments: By default :class:`~torchrl_mpfa.PositiveBoost`, then
+            :class:`~torchrl_mpfa.PositiveDecay`.
         positive_above: A transition is positive when its reward is above this: a number (0 in the
             paper), or ``"mean"``, the mean reward of the buffer. It holds for the entropy of Eq.
             (17), the boost and the decay alike. Where all rewards have one sign, 0 makes all of
             them the same: the TD error and the gradient then get no weight. With ``"mean"`` the
             three weights are equal for any data.
-        **kwargs: As :class:`SignalSampler`, all of whose arguments are taken. Those that are not
-            given are the paper's: its three signals, :class:`~torchrl_mpfa.EntropyFusion`,
-            :class:`~torchrl_mpfa.PositiveBoost` and :class:`~torchrl_mpfa.PositiveDecay`, and the
-            highest priority within the buffer for fresh transitions.
+        entropy_refresh: As in :class:`SignalSampler`.
+        reward_key: Where the signed reward of a transition is read.
 
     Raises:
         ValueError: If an argument is out of its range.
 
     Warns:
-        UserWarning: If ``positive_above`` is ``"mean"`` and the fusion not one's own.
+        UserWarning: If ``positive_above`` is ``"mean"`` and the fusion counts entropies.
 
     Examples:
         >>> sampler = MPFASampler()
         >>> [type(adjust).__name__ for adjust in sampler.adjustments]
         ['PositiveBoost', 'PositiveDecay']
-        >>> MPFASampler(positive_above=-1.0).fusion.positive_above
+        >>> MPFASampler(positive_above=-1.0).positive_above
         -1.0
     """
 
@@ -55,26 +63,33 @@ class MPFASampler(SignalSampler):
         alpha: float = 0.6,
         beta: float = 0.4,
         eps: float = 0.05,
-        *args: Any,
+        dtype: torch.dtype = torch.float,
+        reduction: str = "max",
+        max_priority_within_buffer: bool = True,
+        device: torch.device | str | None = None,
+        *,
+        stratified: bool = False,
+        signals: Sequence[Signal | str] = MPFA_SIGNALS,
+        fusion: Fusion | None = None,
+        adjustments: Sequence[Adjustment] | None = None,
         positive_above: Level = 0.0,
-        **kwargs: Any,
+        entropy_refresh: float = 1 / 256,
+        reward_key: NestedKey = ("next", "reward"),
     ) -> None:
-        positive_above = check(LEVEL, positive_above=positive_above)
-        # Positional as in TorchRL: dtype, reduction, max_priority_within_buffer, device.
-        if len(args) < 3:
-            kwargs.setdefault("max_priority_within_buffer", True)
-        kwargs.setdefault("signals", MPFA_SIGNALS)
-        own = [kwargs.get(name) is not None for name in ("fusion", "adjustments")]
-        if all(own) and positive_above != 0.0:
-            raise ValueError(
-                f"positive_above must be given to a fusion and adjustments of your own, got "
-                f"{positive_above!r} with them"
-            )
-        if not own[0]:
-            kwargs["fusion"] = EntropyFusion(positive_above=positive_above)
-        if not own[1]:
-            kwargs["adjustments"] = (
-                PositiveBoost(positive_above=positive_above),
-                PositiveDecay(positive_above=positive_above),
-            )
-        super().__init__(max_capacity, alpha, beta, eps, *args, **kwargs)
+        super().__init__(
+            max_capacity,
+            alpha,
+            beta,
+            eps,
+            dtype,
+            reduction,
+            max_priority_within_buffer,
+            device,
+            stratified=stratified,
+            signals=signals,
+            fusion=EntropyFusion() if fusion is None else fusion,
+            adjustments=(PositiveBoost(), PositiveDecay()) if adjustments is None else adjustments,
+            positive_above=positive_above,
+            entropy_refresh=entropy_refresh,
+            reward_key=reward_key,
+        )

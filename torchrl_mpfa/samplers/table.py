@@ -12,6 +12,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import (
     COUNT_OR_ZERO,
     bounds,
@@ -39,6 +40,8 @@ class SignalTable:
         signals: The signals that are fused.
         kept: Further signals, known at the write.
         reward_key: Where the signed reward of a transition is read.
+        positive_above: A transition is positive when its reward is above this, a number or
+            ``"mean"``, the mean reward of the buffer.
         device: Device of the tensor.
     """
 
@@ -50,9 +53,11 @@ class SignalTable:
         *,
         kept: Sequence[Signal] = (),
         reward_key: NestedKey = ("next", "reward"),
+        positive_above: Level = 0.0,
         device: torch.device | str = "cpu",
     ) -> None:
         self.capacity, self.reward_key = capacity, reward_key
+        self.positive_above = positive_above
         fused = as_signals(signals)
         self.learned = [s for s in fused if s.known_at == "update"]
         self.written = [*(s for s in fused if s.known_at == "write"), *kept]
@@ -100,6 +105,12 @@ class SignalTable:
     def rewards(self) -> Tensor:
         """Signed rewards of the filled slots, shape ``[size]``."""
         return self.rows[: self.size, self.reward_column]
+
+    @property
+    def level(self) -> float:
+        """Reward above which a transition is positive."""
+        level = self.positive_above
+        return float(self.rewards.mean()) if level == "mean" else float(level)
 
     def blank(self, count: int, device: torch.device | str = "cpu") -> Tensor:
         """Return rows of transitions of which nothing is known yet."""
