@@ -291,19 +291,19 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         sampler, size = self.sampler, len(self)
         if not isinstance(sampler, TreeSampler) or not size:
             return {}
-        found = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
+        columns = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
         table = getattr(sampler, "table", None)
         if table is not None:
-            found |= {name: table.rows[:size, column] for name, column in table.column.items()}
-        return found
+            columns |= {name: table.rows[:size, column] for name, column in table.column.items()}
+        return columns
 
     def stats(self) -> dict[str, Any]:
         """Return TorchRL's counters, and the sampler's statistics of signals and batch."""
         with self._replay_lock:
-            found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
+            numbers: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
-                found.update(self._sampler.stats())
-        return found
+                numbers.update(self._sampler.stats())
+        return numbers
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of all parts as in TorchRL.

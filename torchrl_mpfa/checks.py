@@ -50,8 +50,8 @@ def generator_on(device: torch.device, source: torch.Generator | None) -> torch.
 
     All state is in the source, so that a state saved on a GPU loads without one.
     """
-    own = source is None or source.device == device
-    return source if own else seeded_generator(source, device)
+    usable = source is None or source.device == device
+    return source if usable else seeded_generator(source, device)
 
 
 def check(rule: Rule, **values: Any) -> Any:
@@ -110,11 +110,11 @@ def rules_of(kind: type) -> dict[str, Rule]:
 
     A field has its rule also where a subclass changes its default.
     """
-    found: dict[str, Rule] = {}
-    for each in reversed(kind.__mro__):
-        for name, entry in vars(each).get("__dataclass_fields__", {}).items():
-            found |= {name: entry.metadata["rule"]} if "rule" in entry.metadata else {}
-    return found
+    rules: dict[str, Rule] = {}
+    for base in reversed(kind.__mro__):
+        for name, entry in vars(base).get("__dataclass_fields__", {}).items():
+            rules |= {name: entry.metadata["rule"]} if "rule" in entry.metadata else {}
+    return rules
 
 
 def check_counts(**counts: Any) -> Any:

@@ -31,12 +31,12 @@ def follows(storage: Any, table: SignalTable, before: Tensor, after: Tensor) -> 
     old, new = (
         table.written_at(slots.to(table.device)) < table.loaded for slots in (before, after)
     )
-    found = None
+    same_in_all = None
     for begin, end in _seen(storage._storage):
         first, second = _rows(end, before, storage.ndim), _rows(begin, after, storage.ndim)
         same = ((first == second) | ((first != first) & (second != second))).all(1).cpu()
-        found = same if found is None else found & same
-    return (old == new).cpu() if found is None else found
+        same_in_all = same if same_in_all is None else same_in_all & same
+    return (old == new).cpu() if same_in_all is None else same_in_all
 
 
 def episodes_of(
@@ -63,10 +63,10 @@ def episodes_of(
         [0, 1, 0, 1]
     """
     count, place = len(places), torch.arange(len(places))
-    seen, own = [*_seen(steps)], number.double().view(torch.long).cpu()
+    seen, label = [*_seen(steps)], number.double().view(torch.long).cpu()
     if loaded is not None and not seen:
-        own = 2 * own + loaded
-    ends, begins = own.clone(), own.clone()
+        label = 2 * label + loaded
+    ends, begins = label.clone(), label.clone()
     for weight, (begin, end) in enumerate(seen, 1):
         begins += weight * _hash(_rows(begin, places, ndim))
         ends += weight * _hash(_rows(end, places, ndim))
@@ -93,8 +93,10 @@ def _seen(steps: TensorDictBase) -> Iterator[tuple[Tensor, Tensor]]:
         return
     for key, end in ends.items(True, True):
         begin = steps.get(key, None)
-        known = isinstance(end, Tensor) and isinstance(begin, Tensor) and begin.shape == end.shape
-        if known and as_path(key)[-1] not in _NOT_OBSERVED:
+        observed = (
+            isinstance(end, Tensor) and isinstance(begin, Tensor) and begin.shape == end.shape
+        )
+        if observed and as_path(key)[-1] not in _NOT_OBSERVED:
             yield begin, end
 
 

@@ -154,7 +154,7 @@ def new_dump(path: str | Path) -> Iterator[Path]:
     path.mkdir(exist_ok=True)
     with (path / _LOCK).open("ab") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        numbers = [int(found.name[5:]) for found in _versions(path)]
+        numbers = [int(dump.name[5:]) for dump in _versions(path)]
         folder = path / f"dump-{max(numbers, default=0) + 1}"
         folder.mkdir()
         try:
@@ -184,14 +184,14 @@ def open_dump(path: str | Path) -> Path:
         raise ValueError(f"{path} is not a complete dump of this package: it has no {MANIFEST}")
     try:
         manifest: dict[str, Any] = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        name, files, found = manifest["folder"], dict(manifest["files"]), manifest["format"]
-        own = re.fullmatch(r"dump-\d+", name) and not (path / name).is_symlink()
-        if name != "." and not own:
+        name, files, version = manifest["folder"], dict(manifest["files"]), manifest["format"]
+        is_ours = re.fullmatch(r"dump-\d+", name) and not (path / name).is_symlink()
+        if name != "." and not is_ours:
             raise ValueError(f"it names the folder {name!r}, which is not the dump's own")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path / MANIFEST} is damaged: {error}") from error
-    if found != _FORMAT:
-        raise ValueError(f"format of {path / MANIFEST} is {found}, this version reads {_FORMAT}")
+    if version != _FORMAT:
+        raise ValueError(f"format of {path / MANIFEST} is {version}, this version reads {_FORMAT}")
     folder = path / name
     present = _files(folder)
     for file in sorted({*present} ^ {*files}):
@@ -204,13 +204,13 @@ def open_dump(path: str | Path) -> Path:
 
 
 def _versions(path: Path) -> list[Path]:
-    return [found for found in path.glob("dump-*") if re.fullmatch(r"dump-\d+", found.name)]
+    return [folder for folder in path.glob("dump-*") if re.fullmatch(r"dump-\d+", folder.name)]
 
 
 def _files(folder: Path) -> list[str]:
     """Names of all files under a folder, but for its own manifest, none of which may execute."""
-    found = [file for file in folder.rglob("*") if file != folder / MANIFEST]
-    for file in found:
+    files = [file for file in folder.rglob("*") if file != folder / MANIFEST]
+    for file in files:
         if file.is_symlink() or not (file.is_dir() or file.is_file()):
             raise ValueError(f"{file} is a link or a device: dumps hold files and folders only")
         name = file.name.lower()
@@ -219,7 +219,7 @@ def _files(folder: Path) -> list[str]:
                 f"{file} could execute anything when it is read: dumps hold tensors and plain "
                 "values only"
             )
-    return sorted(file.relative_to(folder).as_posix() for file in found if file.is_file())
+    return sorted(file.relative_to(folder).as_posix() for file in files if file.is_file())
 
 
 def _measure(file: Path) -> list[int]:
@@ -264,11 +264,11 @@ def _hex(file: IO[bytes], end: int) -> bytes:
 def checksum_of(file: IO[bytes], end: int) -> int:
     """CRC-32 of the first ``end`` bytes of a file."""
     file.seek(0)
-    found = 0
+    checksum = 0
     while end > 0 and (chunk := file.read(min(end, 1 << 20))):
-        found = zlib.crc32(chunk, found)
+        checksum = zlib.crc32(chunk, checksum)
         end -= len(chunk)
-    return found
+    return checksum
 
 
 @contextmanager
@@ -294,10 +294,10 @@ def _replacing(path: Path) -> Iterator[IO[bytes]]:
 
 def _remove_leftovers(path: Path) -> None:
     """Remove the temporary files of saves whose process is gone."""
-    for found in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-        process = found.name.removesuffix(".tmp").rpartition(".")[2].partition("-")[0]
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        process = leftover.name.removesuffix(".tmp").rpartition(".")[2].partition("-")[0]
         if process.isdigit() and not _lives(int(process)):
-            found.unlink(missing_ok=True)
+            leftover.unlink(missing_ok=True)
 
 
 def _lives(process: int) -> bool:

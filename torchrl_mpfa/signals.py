@@ -71,9 +71,9 @@ def as_signals(signals: Sequence[Signal | str]) -> tuple[Signal, ...]:
     """Return signals of signals or names; names other than the paper's are of learned signals."""
     if isinstance(signals, str) or not all(isinstance(s, str | Signal) for s in signals):
         raise TypeError(f"signals must be a list of signals or their names, got {signals!r}")
-    known = {signal.name: signal for signal in MPFA_SIGNALS}
-    made = tuple(known.get(s, Signal(s)) if isinstance(s, str) else s for s in signals)
-    names = [signal.name for signal in made]
+    paper = {signal.name: signal for signal in MPFA_SIGNALS}
+    listed = tuple(paper.get(s, Signal(s)) if isinstance(s, str) else s for s in signals)
+    names = [signal.name for signal in listed]
     if not names or len(set(names)) != len(names):
         raise ValueError(f"signals must be one or more different signals, got {names}")
-    return made
+    return listed

@@ -64,7 +64,7 @@ class TransformMemory:
                 _warn_of_steps_past_the_end(part)
         before = {part: _attributes(part) for part in parts}
         copies, random = self.copies(), torch.get_rng_state()
-        sources = [v for own in before.values() for v in own.values()]
+        sources = [v for values in before.values() for v in values.values()]
         sources = [source for source in sources if isinstance(source, torch.Generator)]
         states = [source.get_state() for source in sources]
         try:
@@ -103,7 +103,7 @@ class TransformMemory:
     def empty(self) -> None:
         """Give attributes the values that they had before any write."""
         first = self._first.items()
-        self.set_back({part: _attributes(part) | _copied(own) for part, own in first})
+        self.set_back({part: _attributes(part) | _copied(values) for part, values in first})
 
 
 def _warn_of_steps_past_the_end(part: nn.Module) -> None:
@@ -122,9 +122,11 @@ def _warn_of_steps_past_the_end(part: nn.Module) -> None:
 def _writes(transform: nn.Module) -> bool:
     """Return True if a transform does anything when transitions are written."""
     if isinstance(transform, Compose):
-        return any(_writes(each) for each in transform)
-    own = any(getattr(type(transform), n, None) is not getattr(Transform, n) for n in _AT_A_WRITE)
-    return own or bool(getattr(transform, "in_keys_inv", ()))
+        return any(_writes(part) for part in transform)
+    overrides = any(
+        getattr(type(transform), n, None) is not getattr(Transform, n) for n in _AT_A_WRITE
+    )
+    return overrides or bool(getattr(transform, "in_keys_inv", ()))
 
 
 def _with_masks(data: Any, parts: Sequence[nn.Module]) -> Any:
@@ -138,8 +140,8 @@ def _with_masks(data: Any, parts: Sequence[nn.Module]) -> Any:
 
 
 def _attributes(part: nn.Module) -> _Attributes:
-    own = {name: value for name, value in vars(part).items() if name not in _OF_EVERY_MODULE}
-    return {**own, **part._buffers}
+    attributes = {name: value for name, value in vars(part).items() if name not in _OF_EVERY_MODULE}
+    return {**attributes, **part._buffers}
 
 
 def _is_written_in(value: Any) -> bool:

@@ -43,9 +43,11 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _checks(self, data: Any) -> bool:
         # Not the attribute: the property has the parts made, where that was put off to their use.
         sampler = self.sampler
-        ours = isinstance(sampler, SignalSampler) or isinstance(self._storage, SignalTensorStorage)
+        has_signals = isinstance(sampler, SignalSampler) or isinstance(
+            self._storage, SignalTensorStorage
+        )
         consumes = isinstance(sampler, ConsumingSampler)
-        return ours and not consumes and isinstance(data, TensorDictBase)
+        return has_signals and not consumes and isinstance(data, TensorDictBase)
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
@@ -123,8 +125,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             return priority
         real = isinstance(priority, Tensor) and not priority.is_complex()
         if weighs and prioritizes and not (real and priority.numel() == shape.numel()):
-            found = f"{priority.dtype} of shape {[*priority.shape]}" if real else type(priority)
-            raise ValueError(f"{name} must be one real number for each of {[*shape]}, got {found}")
+            form = f"{priority.dtype} of shape {[*priority.shape]}" if real else type(priority)
+            raise ValueError(f"{name} must be one real number for each of {[*shape]}, got {form}")
         check_finite(name, priority)
         if prioritizes and hasattr(self._sampler, "check_priority"):
             self._sampler.check_priority(priority)

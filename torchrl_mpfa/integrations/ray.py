@@ -83,13 +83,13 @@ class RaySignalReplayBuffer(RayReplayBuffer):
 
     def rewards(self) -> torch.Tensor:
         """Rewards of all transitions, shape ``[N]``."""
-        found: torch.Tensor = self._client.rewards()
-        return found
+        rewards: torch.Tensor = self._client.rewards()
+        return rewards
 
     def distributions(self) -> dict[str, torch.Tensor]:
         """See :meth:`SignalReplayBuffer.distributions`."""
-        found: dict[str, torch.Tensor] = self._client.distributions()
-        return found
+        columns: dict[str, torch.Tensor] = self._client.distributions()
+        return columns
 
     def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """See :meth:`SignalReplayBuffer.update_tensordict_priority`."""

@@ -105,15 +105,15 @@ def make_replay(
         capacity = storage.max_size
     given = {"capacity": capacity, "batch_size": batch_size}
     given = {name: value for name, value in given.items() if value is not None}
-    made = method_named(method, **given, **settings)
-    there = {"policy": policy, "sigma": sigma}
-    missing = " and ".join(name for name in made.needs if there[name] is None)
+    chosen = method_named(method, **given, **settings)
+    given_parts = {"policy": policy, "sigma": sigma}
+    missing = " and ".join(name for name in chosen.needs if given_parts[name] is None)
     if missing:
-        raise ValueError(f"method {made.name!r} needs {missing}: {made.why}")
-    parts = buffer_parts(made, storage=storage, device=device)
+        raise ValueError(f"method {chosen.name!r} needs {missing}: {chosen.why}")
+    parts = buffer_parts(chosen, storage=storage, device=device)
     buffer = SignalReplayBuffer(**parts, generator=generator)
-    select = made.selection(policy, sigma)
-    return Replay(buffer, select, tuple(learned_signals(made)), made, made.entries)
+    select = chosen.selection(policy, sigma)
+    return Replay(buffer, select, tuple(learned_signals(chosen)), chosen, chosen.entries)
 
 
 def buffer_parts(
@@ -141,17 +141,17 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         >>> loss_options("lap")["loss_function"]
         'smooth_l1'
     """
-    made = method_named(method)
+    chosen = method_named(method)
     return {
-        "signals": learned_signals(made),
-        "importance": made.importance,
-        "loss_function": made.loss_function,
-        "target_average": made.target_average,
-        "pal_alpha": made.pal_alpha,
+        "signals": learned_signals(chosen),
+        "importance": chosen.importance,
+        "loss_function": chosen.loss_function,
+        "target_average": chosen.target_average,
+        "pal_alpha": chosen.pal_alpha,
     }
 
 
 def learned_signals(method: Method) -> list[str]:
     """Return the entries that the loss has to write for the signals of a method."""
-    keys = [each.key for each in method.priority_signals() if each.known_at == "update"]
+    keys = [signal.key for signal in method.priority_signals() if signal.known_at == "update"]
     return sorted({key[-1] if isinstance(key, tuple) else key for key in keys})

@@ -132,8 +132,8 @@ class Method:
 
     def sampler(self) -> SignalSampler | RandomSampler:
         """Make the sampler."""
-        made: SignalSampler | RandomSampler = resolve_name(self.kind)(**self.sampler_options())
-        return made
+        sampler: SignalSampler | RandomSampler = resolve_name(self.kind)(**self.sampler_options())
+        return sampler
 
     def selection(self, policy: Any, sigma: Any) -> Selection:
         """Make the function that samples the batches of one training step.
@@ -142,8 +142,8 @@ class Method:
             policy: The policy in training, which is there if :attr:`needs` names it.
             sigma: Standard deviation of its exploration noise, or a function that gives it.
         """
-        found: Selection = resolve_name(self.batches)
-        return found
+        select: Selection = resolve_name(self.batches)
+        return select
 
 
 @dataclass
@@ -189,8 +189,10 @@ class Prioritized(Method):
         from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
         from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 
-        known = {each.name: each for each in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)}
-        return [known.get(name) or Signal(name) for name in self.signals]
+        by_name = {
+            signal.name: signal for signal in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)
+        }
+        return [by_name.get(name) or Signal(name) for name in self.signals]
 
     def fusion(self) -> Fusion:
         """Make the fusion of the signals."""
@@ -204,7 +206,7 @@ class Prioritized(Method):
 
     def sampler(self) -> SignalSampler:
         """Make the sampler."""
-        made: SignalSampler = resolve_name(self.kind)(
+        sampler: SignalSampler = resolve_name(self.kind)(
             self.capacity,
             self.alpha,
             self.beta,
@@ -217,4 +219,4 @@ class Prioritized(Method):
             positive_above=self.positive_above,
             **self.sampler_options(),
         )
-        return made
+        return sampler

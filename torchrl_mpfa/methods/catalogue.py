@@ -333,8 +333,8 @@ def method_named(method: str | Method, **settings: Any) -> Method:
         method = METHODS[method]
     elif not isinstance(method, Method):
         raise TypeError(f"method must be a name or a Method, got {method!r}")
-    known = [each.name for each in fields(method)]
+    settings_of = [setting.name for setting in fields(method)]
     for name in settings:
-        if name not in known:
-            raise ValueError(unknown(f"setting of {method.name}", name, known))
+        if name not in settings_of:
+            raise ValueError(unknown(f"setting of {method.name}", name, settings_of))
     return replace(method, **settings)

@@ -169,7 +169,7 @@ class HindsightGoals(Transform):
         episode[mine] = episodes_of(rows, mine, number[mine], done[mine])
         ended = episode[done]
         self._pending = (rows[~torch.isin(episode, ended)],)
-        return [rows[episode == each] for each in ended.tolist()]
+        return [rows[episode == number] for number in ended.tolist()]
 
     def _in_hindsight(self, episode: TensorDictBase) -> TensorDictBase:
         steps = future_goals(len(episode), self.goals, self.generator)

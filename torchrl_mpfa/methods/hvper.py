@@ -93,7 +93,7 @@ class ScheduledFusion(Fusion):
 
     def __post_init__(self) -> None:
         self._ends = FixedFusion(self.start), FixedFusion(self.end)
-        self.start, self.end = (each.values for each in self._ends)
+        self.start, self.end = (fusion.values for fusion in self._ends)
         self._fraction = 0.0
 
     @property
@@ -116,7 +116,7 @@ class ScheduledFusion(Fusion):
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return the present weights in the order of ``names``, shape ``[K]``."""
-        start, end = (each.weights(names, table, index) for each in self._ends)
+        start, end = (fusion.weights(names, table, index) for fusion in self._ends)
         return start.lerp(end, self._fraction)
 
 

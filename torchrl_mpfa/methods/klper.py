@@ -130,8 +130,8 @@ class KLPERSelection:
 
     def select(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         """Sample a batch and choose: a :class:`~torchrl_mpfa.selection.Selection`."""
-        for each in one_batch(buffer):
-            yield replace(each, batch=self(each.batch))
+        for sampled in one_batch(buffer):
+            yield replace(sampled, batch=self(sampled.batch))
 
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -52,21 +52,21 @@ class Adjusted(Prioritized):
         """Make the boost and the decay that are on."""
         from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
 
-        made: list[Adjustment] = []
+        parts: list[Adjustment] = []
         if self.boost:
             boost = PositiveBoost(
                 boost=self.boost_factor,
                 bound=self.boost_bound,  # type: ignore[arg-type]
                 target_share=self.boost_target,
             )
-            made.append(boost)
+            parts.append(boost)
         if self.decay:
             decay = PositiveDecay(
                 sharpness=self.decay_sharpness,
                 position=self.decay_position,  # type: ignore[arg-type]
             )
-            made.append(decay)
-        return made
+            parts.append(decay)
+        return parts
 
 
 @dataclass

@@ -79,8 +79,8 @@ def reliability(
     sums = errors.new_zeros(len(lengths)).index_add_(0, number, errors)
     before = sums.cumsum(0) - sums  # Of all episodes in front of this one.
     until = errors.cumsum(0) - before[number]
-    whole = sums[number] if total is None else total[order].double()
-    share = torch.where(whole > 0, until / whole, 1.0).clamp(0.0, 1.0)
+    sum_of_episode = sums[number] if total is None else total[order].double()
+    share = torch.where(sum_of_episode > 0, until / sum_of_episode, 1.0).clamp(0.0, 1.0)
     return torch.empty_like(share).index_copy_(0, order, share)
 
 
@@ -171,22 +171,22 @@ class ReaPERSampler(SignalSampler):
         if self._numbered == table.writes:
             return
         time = table.rows[: table.size, table.time_column].cpu()
-        known = self._open[time[self._open] < self._numbered]
-        slots = torch.cat((known, (time >= self._numbered).nonzero().squeeze(1)))
+        open_slots = self._open[time[self._open] < self._numbered]
+        slots = torch.cat((open_slots, (time >= self._numbered).nonzero().squeeze(1)))
         slots = slots[time[slots].argsort()]
         number, last = (table.rows[slots, table.column[s.name]].cpu() for s in (EPISODE, ENDED))
         loaded, data = time[slots] < table.loaded, self._steps._storage
         first = episodes_of(data, slots, number, last > 0, loaded, ndim=self._steps.ndim)
         is_new = time[slots] >= self._numbered
-        fresh = self._last_number + ((first == torch.arange(len(first))) & is_new).cumsum(0)
-        found = torch.where(is_new, fresh, self._episodes[slots].cpu())[first]
-        self._last_number = int(fresh[-1])
-        self._episodes[slots] = found.to(self.device)
+        new_ids = self._last_number + ((first == torch.arange(len(first))) & is_new).cumsum(0)
+        ids = torch.where(is_new, new_ids, self._episodes[slots].cpu())[first]
+        self._last_number = int(new_ids[-1])
+        self._episodes[slots] = ids.to(self.device)
         # The last step of each is the one that is written last.
-        tail = torch.zeros(self._last_number + 1, dtype=torch.long)
-        tail[found] = torch.arange(len(found))
-        tail = tail[found.unique()].sort().values
-        self._open = slots[tail[~(last[tail] > 0)]][-_UNDER_WAY:]
+        last_step = torch.zeros(self._last_number + 1, dtype=torch.long)
+        last_step[ids] = torch.arange(len(ids))
+        last_step = last_step[ids.unique()].sort().values
+        self._open = slots[last_step[~(last[last_step] > 0)]][-_UNDER_WAY:]
         self._numbered = table.writes
 
     def _rely(self, table: SignalTable, slots: Tensor) -> None:
@@ -220,7 +220,7 @@ class ReaPERSampler(SignalSampler):
 def _numbers(episode: Tensor) -> Tensor:
     """Episodes numbered from 0, with gaps, shape ``[N]``."""
     lowest = episode.min()
-    found = (episode - lowest).long()
-    if bool((found + lowest == episode).all()) and int(found.max()) < _SPARSE * len(found):
-        return found
+    number = (episode - lowest).long()
+    if bool((number + lowest == episode).all()) and int(number.max()) < _SPARSE * len(number):
+        return number
     return torch.unique(episode, return_inverse=True)[1]

@@ -68,8 +68,8 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
     With :math:`\eta' = \min(\eta, \beta)` it is :math:`(1 - \eta') \beta` where more are far than
     allowed, else :math:`(1 - \eta') \beta + \min(\eta, 1 - \beta)`.
     """
-    kept = (1.0 - min(rate, weight)) * weight
-    return kept if far > allowed else kept + min(rate, 1.0 - weight)
+    lowered = (1.0 - min(rate, weight)) * weight
+    return lowered if far > allowed else lowered + min(rate, 1.0 - weight)
 
 
 class ReFERSampler(SavedSampler, RandomSampler):

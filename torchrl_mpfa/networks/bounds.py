@@ -37,9 +37,9 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
             f"got shape {tuple(action_spec.shape)}"
         )
     rows = [bound.reshape(-1, low.shape[-1]) for bound in (low, high)]
-    if not all(bool((each == each[:1]).all()) for each in rows):
+    if not all(bool((row == row[:1]).all()) for row in rows):
         raise ValueError("action_spec must have the same bounds for all environments of a batch")
-    low, high = (each[0].float().clone() for each in rows)
+    low, high = (row[0].float().clone() for row in rows)
     if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
         raise ValueError(
             f"action_spec must have finite bounds, low < high, got {low.tolist()} and "

@@ -150,8 +150,8 @@ class Critic(nn.Module):
             joined = torch.cat((self.first(observation), action), -1)
         else:
             joined = self.first(torch.cat((observation, action), -1))
-        found: Tensor = self.rest(joined)
-        return found
+        value: Tensor = self.rest(joined)
+        return value
 
 
 def make_actor(

@@ -118,14 +118,14 @@ class StochasticActor(ProbabilisticActor):
         The action is random under ``set_exploration_type(ExplorationType.RANDOM)``; otherwise it
         is the tanh of the mean, scaled to the bounds of actions.
         """
-        found: dict[NestedKey, Tensor] = self.module[0].outputs(inputs)
+        outputs: dict[NestedKey, Tensor] = self.module[0].outputs(inputs)
         if (exploration_type() or self.default_interaction_type) is ExplorationType.RANDOM:
             action, _ = sample_tanh_normal(
-                found["preactivation"], found["scale"], self.action_scale
+                outputs["preactivation"], outputs["scale"], self.action_scale
             )
         else:
-            action = self.mean_action(found["preactivation"])
-        return {**found, "action": action}
+            action = self.mean_action(outputs["preactivation"])
+        return {**outputs, "action": action}
 
     def mean_action(self, preactivation: Tensor) -> Tensor:
         """Squash the mean before the tanh, ``[..., A]``, to the action without noise."""
@@ -136,9 +136,9 @@ class StochasticActor(ProbabilisticActor):
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Sample actions, ``[..., A]``, log-densities, ``[...]``, and the means before the tanh."""
-        found = self.module[0].outputs(inputs)
-        loc: Tensor = found["preactivation"]
-        return *sample_tanh_normal(loc, found["scale"], self.action_scale), loc
+        outputs = self.module[0].outputs(inputs)
+        loc: Tensor = outputs["preactivation"]
+        return *sample_tanh_normal(loc, outputs["scale"], self.action_scale), loc
 
 
 def make_stochastic_actor(

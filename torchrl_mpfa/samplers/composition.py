@@ -22,34 +22,34 @@ def composition(
     """Return numbers of the buffer, and of slots and weights of its last batch, by name."""
     table, weights = sampler.table, sampler.weights
     names = table.names[table.fused]
-    found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
+    numbers: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
     for place, adjust in enumerate(sampler.adjustments):
         if isinstance(adjust, PositiveBoost):
             counted = () if weighing is None else weighing.counted
             factor = adjust.factor(counted[place] if counted else None)
-            found.setdefault("boost_factor", float(factor))
+            numbers.setdefault("boost_factor", float(factor))
     if table.size == 0:
-        return found
+        return numbers
     level = table.level
-    found["positive_fraction_buffer"] = float((table.rewards > level).double().mean())
+    numbers["positive_fraction_buffer"] = float((table.rewards > level).double().mean())
     if batch is None:
-        return found
+        return numbers
     index, importance = batch
     rows = table.rows[index]
     if (entropies := sampler.fusion.entropies(names, table, index)) is not None:
-        found |= {f"entropy/{n}": v for n, v in zip(names, entropies.tolist(), strict=True)}
-    known = rows[:, table.fused]
-    known = known[~known.isnan().any(1)]
-    if weights and len(known):
+        numbers |= {f"entropy/{n}": v for n, v in zip(names, entropies.tolist(), strict=True)}
+    signals = rows[:, table.fused]
+    signals = signals[~signals.isnan().any(1)]
+    if weights and len(signals):
         # Shares in the mean priority of Eq. (21); equal ones if every signal is zero.
         ordered = torch.tensor([weights[name] for name in names], dtype=torch.double)
-        parts = known.mean(0) * ordered.to(known.device)
+        parts = signals.mean(0) * ordered.to(signals.device)
         shares = parts / parts.sum() if parts.sum() > 0 else torch.full_like(parts, 1 / len(parts))
-        found |= {f"share/{n}": v for n, v in zip(names, shares.tolist(), strict=True)}
+        numbers |= {f"share/{n}": v for n, v in zip(names, shares.tolist(), strict=True)}
     positive = rows[:, table.reward_column] > level
     age = table.writes - 1 - rows[:, table.time_column]
     return {
-        **found,
+        **numbers,
         "positive_fraction_batch": float(positive.double().mean()),
         "effective_sample_size": float(importance.sum().square() / importance.square().sum()),
         "sampled_age_mean": float(age.mean()),

@@ -324,18 +324,18 @@ class SignalSampler(TreeSampler):
         table.check_fused(rows)
         if slots.numel() == 0:
             return stale
-        weighing, adjusted, at_once = self._weighing, [], 1
-        if stale == 0 and self._takes_batches():
-            sizes, at_once = [len(slots)], batches
-        for one, of_one in by_batch(sizes, slots, rows):
-            if len(one):
-                first = one[: len(one) // at_once]
-                weighing = self._weigh(table, first, weighing)  # Eqs. (15)-(20).
+        together = batches if stale == 0 and self._takes_batches() else 1
+        groups = [(slots, rows)] if together > 1 else by_batch(sizes, slots, rows)
+        weighing, priorities = self._weighing, []
+        for group_slots, group_rows in groups:
+            if len(group_slots):
+                first_batch = group_slots[: len(group_slots) // together]
+                weighing = self._weigh(table, first_batch, weighing)  # Eqs. (15)-(20).
                 # Eqs. (21)-(24).
-                adjusted.append(self._fused(table, of_one, one, weighing, at_once))
-        priority = adjusted[0] if len(adjusted) == 1 else torch.cat(adjusted)
+                priorities.append(self._fused(table, group_rows, group_slots, weighing, together))
+        priority = priorities[0] if len(priorities) == 1 else torch.cat(priorities)
         if (last := last_of_each(slots)) is not None:
-            slots, rows, priority = (each.index_select(0, last) for each in (slots, rows, priority))
+            slots, rows, priority = slots[last], rows[last], priority[last]
         highest = self._checked(priority, "adjusted priorities")
 
         # Nothing has changed so far, so that a call that raises leaves everything as it was.
@@ -365,12 +365,14 @@ class SignalSampler(TreeSampler):
             written_at=rows.select(1, table.time_column).view(shape),
         )
         for place, adjust in enumerate(self.adjustments):
-            own = replace(facts, counted=weighing.counted[place]) if weighing.counted else facts
-            priority = adjust(priority, own)
-        if priority.shape != slots.shape:
-            raise ValueError(
-                f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
-            )
+            if weighing.counted:
+                facts = replace(facts, counted=weighing.counted[place])
+            priority = adjust(priority, facts)
+            if priority.shape != slots.shape:
+                raise ValueError(
+                    f"adjusted priorities must have shape {[*slots.shape]}, got "
+                    f"{[*priority.shape]} from {type(adjust).__name__}"
+                )
         return priority.to(torch.double).reshape(-1)
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
@@ -379,33 +381,30 @@ class SignalSampler(TreeSampler):
 
     def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
         """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
-        always = self.entropy_refresh == 0
-        fresh = table.writes - (0 if last is None else last.writes)
-        due = always or not 0 <= fresh <= self.entropy_refresh * table.size
-        if last is None or due:
-            weights, rewards = (
-                checked_weights(self.fusion, self._names, table, index),
-                table.rewards,
-            )
+        weighing = last or Weighing()
+        changed = table.writes - weighing.writes
+        kept = 0 <= changed <= self.entropy_refresh * table.size and self.entropy_refresh > 0
+        due = last is None or not kept
+        if due or self.fusion.every_batch:
+            weights = checked_weights(self.fusion, self._names, table, index)
+            weighing = replace(weighing, weights=weights)
+        if due:
             if (text := one_sided(self)) is not None:
                 self._warn_once(text)
-            mean, before = float(rewards.mean()), last or Weighing()
-            made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
-        elif self.fusion.every_batch:
-            made = replace(last, weights=checked_weights(self.fusion, self._names, table, index))
-        else:
-            made = last
-        return self._count(table, len(index), made, always) if any(self._counting) else made
+            mean = float(table.rewards.mean())
+            weighing = replace(weighing, mean_reward=mean, writes=table.writes)
+        return self._count(table, len(index), weighing) if any(self._counting) else weighing
 
-    def _count(self, table: SignalTable, learned: int, last: Weighing, always: bool) -> Weighing:
+    def _count(self, table: SignalTable, learned: int, last: Weighing) -> Weighing:
         """Have the adjustments count the buffer again if enough of it changed."""
         changed = table.writes - last.counted_writes + last.learned_since
-        if last.counted and 0 <= changed <= _COUNT_REFRESH * table.size and not always:
+        few = 0 <= changed <= _COUNT_REFRESH * table.size and self.entropy_refresh > 0
+        if last.counted and few:
             return replace(last, learned_since=last.learned_since + learned)
         fused = self._combined(table.rows[: table.size], last)
         counted = [
-            each.count(table, fused) if counts else None
-            for each, counts in zip(self.adjustments, self._counting, strict=True)
+            adjust.count(table, fused) if counts else None
+            for adjust, counts in zip(self.adjustments, self._counting, strict=True)
         ]
         for value in counted:
             if value is not None:

@@ -347,8 +347,8 @@ class TreeSampler(SavedTrees):
         ):
             highest = -self._max_tree.query(0, self._max_capacity)
             return highest.where(highest >= 0, first)
-        known = self._highest_priority()
-        return first if known is None else known
+        priority = self._highest_priority()
+        return first if priority is None else priority
 
     def add(self, index: Tensor | int) -> None:
         """Nothing to do: the tree of highest priorities forgets an overwritten slot by itself."""
@@ -382,20 +382,20 @@ class TreeSampler(SavedTrees):
                 f"priority of shape {value.shape} and index {slots.shape}."
             )
         value = value.to(torch.double).reshape(-1).expand(slots.shape)
-        kept = check_index(slots, self._max_capacity)
-        if len(kept) == 0:
+        stored = check_index(slots, self._max_capacity)
+        if len(stored) == 0:
             return
-        value = value if len(kept) == len(slots) else value[slots >= 0]
+        value = value if len(stored) == len(slots) else value[slots >= 0]
         check_finite("priority", value)
         highest = self._checked(value + self._eps)
-        if (last := last_of_each(kept)) is not None:
-            kept, value = kept[last], value[last]
-        inherited, value = self._inherited(kept, value), value + self._eps
+        if (last := last_of_each(stored)) is not None:
+            stored, value = stored[last], value[last]
+        inherited, value = self._inherited(stored, value), value + self._eps
         if bool(inherited.any()):
-            self._write(kept[inherited], value[inherited], learned=False)
-            kept, value = kept[~inherited], value[~inherited]
-        if len(kept):
-            self._set(kept, value, highest)
+            self._write(stored[inherited], value[inherited], learned=False)
+            stored, value = stored[~inherited], value[~inherited]
+        if len(stored):
+            self._set(stored, value, highest)
 
     def check_priority(self, priority: Tensor) -> None:
         """Reject priorities of new transitions, before eps, as :meth:`update_priority`."""

@@ -221,7 +221,7 @@ class SignalSliceSampler(SignalSampler):
         joined &= ~_column(storage, self.end_key, slots).bool().squeeze(1)
         key = _TRAJ_IDS if self.traj_key is None else self.traj_key
         one = torch.zeros(len(slots), 1, dtype=torch.bool)
-        ids = [_column(storage, key, each, default=one) for each in (slots, following)]
+        ids = [_column(storage, key, places, default=one) for places in (slots, following)]
         joined &= (ids[0] == ids[1]).squeeze(1) & follows(storage, table, slots, following)
         self._joined[slots] = joined
 
@@ -248,11 +248,11 @@ class SignalSliceSampler(SignalSampler):
         """Write the present leaves of slices, by their starts, shape ``[S]``."""
         starts = starts[self._priorities[starts].isfinite()]
         for part in starts.split(_AT_ONCE):
-            priority, whole = self._of_slices(part, self._priorities, self._joined, self._stride)
+            priority, full = self._of_slices(part, self._priorities, self._joined, self._stride)
             leaf = self._leaf(priority)
-            set_leaves(part, leaf.where(whole, 0.0), self._sum_tree)
+            set_leaves(part, leaf.where(full, 0.0), self._sum_tree)
             # What cannot be sampled is not the lowest.
-            set_leaves(part, leaf.where(whole, math.inf), self._min_tree)
+            set_leaves(part, leaf.where(full, math.inf), self._min_tree)
 
     def _of_slices(
         self, starts: Tensor, priorities: Tensor, joined: Tensor, stride: int
@@ -260,10 +260,10 @@ class SignalSliceSampler(SignalSampler):
         """Return each slice's priority and a mask of full-length slices, both ``[S]``."""
         slots, inside = self._windows(starts, joined, stride)
         length = inside.sum(1)
-        whole = (length == self.slice_len) | (not self.strict_length)
+        full = (length == self.slice_len) | (not self.strict_length)
         if self.slice_priority == "start":
-            return priorities[starts], whole
-        return priorities[slots].where(inside, 0.0).sum(1) / length, whole
+            return priorities[starts], full
+        return priorities[slots].where(inside, 0.0).sum(1) / length, full
 
     def _restore(self, state: dict[str, Any]) -> None:
         check_saved("sampler", state, **{name: getattr(self, name) for name in _SETTINGS})

@@ -34,8 +34,10 @@ class SavedSampler:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on but for the generator, on the CPU."""
-        own = {name: getattr(self, name) for name in self.SAVED}
-        copies = {k: v.to("cpu", copy=True) if isinstance(v, Tensor) else v for k, v in own.items()}
+        attributes = {name: getattr(self, name) for name in self.SAVED}
+        copies = {
+            k: v.to("cpu", copy=True) if isinstance(v, Tensor) else v for k, v in attributes.items()
+        }
         return {"_format": FORMAT, "_kind": self.KIND, **copies}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -123,8 +125,8 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
         if not bool(self._sum_tree.query(0, size) < math.inf):
             raise ValueError("'_sum_tree' of the saved sampler must have a finite sum, got inf")
         if bool(learned.any()):
-            known = slots[learned]
-            set_leaves(known, -self._priorities[known], self._max_tree)
+            slots = slots[learned]
+            set_leaves(slots, -self._priorities[slots], self._max_tree)
 
 
 def alike(name: str, saved: Any, own: Any) -> Any:
@@ -134,9 +136,9 @@ def alike(name: str, saved: Any, own: Any) -> Any:
             raise ValueError(f"{name!r} of the saved sampler must be a plain value, got {saved}")
         return saved
     # A tensor that is empty at first may have any length.
-    fits = isinstance(saved, Tensor) and saved.dtype is own.dtype and saved.ndim == own.ndim
-    if not fits or (len(own) and saved.shape != own.shape):
-        found = f"{saved.dtype} of shape {[*saved.shape]}" if isinstance(saved, Tensor) else saved
+    matches = isinstance(saved, Tensor) and saved.dtype is own.dtype and saved.ndim == own.ndim
+    if not matches or (len(own) and saved.shape != own.shape):
+        form = f"{saved.dtype} of shape {[*saved.shape]}" if isinstance(saved, Tensor) else saved
         wanted = f"{own.dtype} of shape {[*own.shape]}"
-        raise ValueError(f"{name!r} of the saved sampler must be {wanted}, got {found}")
+        raise ValueError(f"{name!r} of the saved sampler must be {wanted}, got {form}")
     return saved.to(own.device, copy=True)

@@ -93,7 +93,7 @@ def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
 def as_slots(index: Any, storage: Any = None) -> Tensor:
     """Return flat slots ``[B]`` of slots, of places ``[B, D]``, or of a tuple of ``D`` places."""
     if isinstance(index, tuple):
-        index = torch.stack([as_integers(each).reshape(-1) for each in index], -1)
+        index = torch.stack([as_integers(places).reshape(-1) for places in index], -1)
     if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
         return index
     slots = as_integers(index)

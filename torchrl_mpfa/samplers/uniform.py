@@ -71,6 +71,6 @@ class CERSampler(NewestSampler):
         index, info = super().sample(storage, batch_size)
         if self.newest is not None:
             along = index if isinstance(index, tuple) else (index,)
-            for each, place in zip(along, self.newest, strict=True):
-                each[0] = place
+            for places, place in zip(along, self.newest, strict=True):
+                places[0] = place
         return index, info

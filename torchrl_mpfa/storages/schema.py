@@ -78,15 +78,15 @@ def as_integers(index: Any) -> Tensor:
     """Return an index of any form but a tuple as a tensor of integers."""
     index = as_index(index)
     try:
-        found = torch.as_tensor(index)
+        integers = torch.as_tensor(index)
     except (RuntimeError, TypeError, ValueError):
         raise TypeError(f"index must hold integers, got {index!r}") from None
-    if found.ndim and len(found) == 0:
-        return found.long()
+    if integers.ndim and len(integers) == 0:
+        return integers.long()
     # A mask would be read as slots 0 and 1, and tensordicts in a list as nothing.
-    if found.dtype is torch.bool or found.is_floating_point() or found.is_complex():
-        raise TypeError(f"index must hold integers, got {found.dtype}")
-    return found.long()
+    if integers.dtype is torch.bool or integers.is_floating_point() or integers.is_complex():
+        raise TypeError(f"index must hold integers, got {integers.dtype}")
+    return integers.long()
 
 
 def as_path(key: NestedKey) -> _Path:
@@ -112,7 +112,7 @@ def _count(tree: _Tree) -> int:
 def _match(
     tree: _Tree, data: TensorDictBase, lead: int, whole: bool, path: _Path, pairs: Pairs
 ) -> None:
-    known = 0
+    matched = 0
     for key, value in data.items():
         expected = tree.get(key)
         if type(expected) is _Entry:
@@ -129,8 +129,8 @@ def _match(
                 f"entry {_name(path, key)} is not in the storage, whose first transitions did not "
                 "have it: leave it out, or write it from the start"
             )
-        known += expected is not None
-    if whole and known != len(tree):
+        matched += expected is not None
+    if whole and matched != len(tree):
         for key in tree:
             if key != INDEX_KEY and data.get(key, None) is None:
                 raise KeyError(f"entry {_name(path, key)} is missing in the transitions")
