@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -22,6 +23,9 @@ from torchrl.modules import (
     TanhNormal,
     ValueOperator,
 )
+from torchrl.objectives import LossModule
+
+import torchrl_mpfa as mpfa
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/howto/torchrl_script.md"
 ROWS, OBSERVED, ACTIONS = 8, 4, 2
@@ -114,15 +118,24 @@ LOSSES: dict[str, Callable[[], nn.Module]] = {
 }
 
 
-def documented() -> dict[str, tuple[str, bool, bool]]:
-    """What the page says of each loss: its TD error, weights in a loss, weights in the actor's."""
+class Row(NamedTuple):
+    """What the page says of a loss."""
+
+    td_error: str
+    weighted: bool
+    weighted_actor: bool
+    slope: bool
+
+
+def documented() -> dict[str, Row]:
+    """The rows of the page by the name of the loss."""
     told = {}
     for line in PAGE.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if line.startswith("| `") and "Loss`" in cells[0]:
             weighted, actor = cells[2].startswith("yes"), "for the actor" in cells[2]
             for name in re.findall(r"`(\w+Loss)`", cells[0]):
-                told[name] = (cells[1], weighted, actor)
+                told[name] = Row(cells[1], weighted, actor, cells[3] == "yes")
     return told
 
 
@@ -171,7 +184,99 @@ def test_loss_of_torchrl_writes_what_the_page_says(name: str) -> None:
     kind = kinds[round(power)]
     assert power == pytest.approx(round(power), abs=0.05)
     critics = {"loss", "loss_value", "loss_qvalue"}
-    assert documented()[name] == (kind, bool(changed & critics), "loss_actor" in changed)
+    assert documented()[name][:3] == (kind, bool(changed & critics), "loss_actor" in changed)
+
+
+def called(name: str, rows: TensorDict) -> LossModule:
+    """A loss of TorchRL's that was called with a batch."""
+    torch.manual_seed(0)
+    loss = LOSSES[name]()
+    if name != "DistributionalDQNLoss":
+        loss.make_value_estimator(gamma=0.99)
+    loss(rows)
+    return loss
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", LOSSES)
+def test_td_error_of_each_loss_becomes_the_absolute_one(name: str) -> None:
+    rows = last_steps(name, torch.ones(ROWS))
+    loss = called(name, rows)
+    mpfa.write_signals(rows, loss)
+    found = rows["signals", "td_error"]
+    assert found.shape == (ROWS,)
+    if name == "DistributionalDQNLoss":  # A cross entropy.
+        assert found.equal(rows["td_error"].reshape(-1))
+    else:  # Next to such rewards the values are nothing.
+        rewards = rows["next", "reward"].reshape(-1)
+        torch.testing.assert_close(found, rewards, rtol=0.01, atol=0.0)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", LOSSES)
+def test_slope_of_each_loss_is_that_of_the_first_critic_or_missing(name: str) -> None:
+    rows = last_steps(name, torch.ones(ROWS))
+    loss = called(name, rows)
+    mpfa.write_signals(rows, loss)
+    has_slope = ("signals", "action_gradient") in rows.keys(True)
+    assert has_slope == documented()[name].slope
+    if not has_slope:
+        return
+    weights = loss.value_network_params if name == "DDPGLoss" else loss.qvalue_network_params[0]
+    # The critic is linear: its slope is the weight of the action, the mean of all quantiles'.
+    layer = weights["module", "layer", "weight"].detach()
+    slope = layer[:, OBSERVED:].mean(0).norm().expand(ROWS)
+    torch.testing.assert_close(rows["signals", "action_gradient"], slope)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_slope_changes_neither_a_batch_normalization_nor_the_random_numbers() -> None:
+    layers = nn.Sequential(
+        nn.Linear(OBSERVED + ACTIONS, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, 1)
+    )
+
+    class Joint(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layers = layers
+
+        def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+            return self.layers(torch.cat([observation, action], dim=-1))
+
+    loss = objectives.CrossQLoss(stochastic(), ValueOperator(Joint(), ["observation", "action"]))
+    loss.make_value_estimator(gamma=0.99)
+    rows = last_steps("CrossQLoss", torch.ones(ROWS))
+    loss(rows)
+    training = [module.training for module in loss.modules()]
+    before = {name: value.clone() for name, value in loss.state_dict().items()}
+    random = torch.get_rng_state()
+    mpfa.write_signals(rows, loss)
+    assert all(value.equal(before[name]) for name, value in loss.state_dict().items())
+    assert random.equal(torch.get_rng_state())
+    assert training == [module.training for module in loss.modules()]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_several_td_errors_of_a_transition_are_rejected() -> None:
+    rows = last_steps("DDPGLoss", torch.ones(ROWS))
+    loss = called("DDPGLoss", rows)
+    rows["td_error"] = torch.ones(ROWS, 3)
+    with pytest.raises(ValueError, match=r"'td_error' must have one number per transition, got sh"):
+        mpfa.write_signals(rows, loss)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", LOSSES)
+def test_loss_that_ignores_weights_gives_one_number_per_transition_for_them(name: str) -> None:
+    """Eq. (11) by hand, as the page says: the mean of weight times loss."""
+    if documented()[name].weighted:
+        return
+    torch.manual_seed(0)
+    loss = LOSSES[name]()
+    loss.make_value_estimator(gamma=0.99)
+    loss.reduction = "none"
+    values = loss(last_steps(name, torch.ones(ROWS)))["loss_qvalue"]
+    assert values.shape[-1] == ROWS
 
 
 def test_page_has_a_row_for_each_loss_with_a_critic() -> None:

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
-from torchrl.objectives import ClipPPOLoss, DDPGLoss, DQNLoss, SACLoss, TD3Loss, TQCLoss
+from torchrl.objectives import ClipPPOLoss, DDPGLoss, DQNLoss, SACLoss, TD3Loss
 
 from tests.mpfa.losses import make_batch, make_networks
 from torchrl_mpfa import make_ddpg_loss, make_sac_loss, make_td3_loss, write_signals
@@ -114,6 +114,5 @@ def test_a_batch_that_the_loss_has_not_seen_and_another_loss_are_rejected():
     loss = of_torchrl("ddpg", *make_networks())
     with pytest.raises(KeyError, match=r"'td_error' is missing in the batch: call loss\(batch\)"):
         write_signals(make_batch(4), loss)
-    for kind in (ClipPPOLoss, TQCLoss):
-        with pytest.raises(TypeError, match=rf"must be TorchRL's DDPGLoss, .*got {kind.__name__}"):
-            write_signals(make_batch(4), kind.__new__(kind))
+    with pytest.raises(TypeError, match=r"such as DDPGLoss, got ClipPPOLoss: write batch\["):
+        write_signals(make_batch(4), ClipPPOLoss.__new__(ClipPPOLoss))

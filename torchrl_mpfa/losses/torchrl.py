@@ -8,43 +8,54 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
+    CQLLoss,
+    CrossQLoss,
     DDPGLoss,
+    DiscreteCQLLoss,
+    DiscreteIQLLoss,
     DiscreteSACLoss,
+    DistributionalDQNLoss,
     DQNLoss,
+    IQLLoss,
     LossModule,
+    REDQLoss,
     SACLoss,
+    TD3BCLoss,
     TD3Loss,
-    TQCLoss,
 )
 
 from torchrl_mpfa.losses.functional import action_gradient
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
-_SQUARED = (DDPGLoss, TD3Loss, DQNLoss)
+_SQUARED = (DDPGLoss, TD3Loss, TD3BCLoss, REDQLoss, IQLLoss, CQLLoss, DQNLoss, DiscreteCQLLoss)
 """Losses that write the square of the TD error."""
-_CONTINUOUS = (DDPGLoss, TD3Loss, SACLoss)
-"""Losses whose critic has a gradient by the action."""
-SUPPORTED = (*_CONTINUOUS, DQNLoss, DiscreteSACLoss)
+_ABSOLUTE = (SACLoss, CrossQLoss, DiscreteSACLoss, DistributionalDQNLoss)
+"""Losses that write the absolute TD error; the distributional one a cross entropy in its place."""
+SUPPORTED = (*_SQUARED, *_ABSOLUTE)
 
 
 def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0) -> None:
     r"""Write the signals of Eqs. (13)-(14) in a batch that one of TorchRL's losses was called with.
 
-    The TD error is the largest of the critics, as TorchRL writes it, and the slope that of the
-    first critic. The slope takes a forward and a backward pass of its own: call this before the
-    step of the optimizer, by which the critic would be another one.
+    The TD error is the largest of the critics, as TorchRL writes it. The slope is that of the first
+    critic in its evaluation mode, of quantiles that of their mean. The slope takes a forward and a
+    backward pass of its own: call this before the step of the optimizer, by which the critic would
+    be another one.
 
     Args:
         batch: Transitions, batch size ``[B]``, that ``loss(batch)`` was called with; gets
             ``("signals", "td_error")`` and ``("signals", "action_gradient")``, each ``[B]``.
-        loss: ``DDPGLoss``, ``TD3Loss`` or ``SACLoss``; or ``DQNLoss`` or ``DiscreteSACLoss``, which
-            have a TD error alone.
+        loss: ``DDPGLoss``, ``TD3Loss``, ``TD3BCLoss``, ``SACLoss``, ``REDQLoss``, ``CrossQLoss``,
+            ``IQLLoss``, ``CQLLoss`` or ``TQCLoss``; or ``DQNLoss``, ``DistributionalDQNLoss``,
+            ``DiscreteSACLoss``, ``DiscreteIQLLoss`` or ``DiscreteCQLLoss``, which have a TD error
+            alone.
         order: Order of the norm in Eq. (14).
 
     Raises:
         KeyError: If the loss was not called with the batch.
         TypeError: If the loss is another one.
+        ValueError: If the loss has several TD errors for a transition, as of several agents.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -62,23 +73,27 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
         >>> sorted(batch["signals"].keys())
         ['action_gradient', 'td_error']
     """
-    # The values of TQC are quantiles.
-    if not isinstance(loss, SUPPORTED) or isinstance(loss, TQCLoss):
+    if not isinstance(loss, SUPPORTED):
         raise TypeError(
-            "loss must be TorchRL's DDPGLoss, TD3Loss, SACLoss, DQNLoss or DiscreteSACLoss, got "
+            f"loss must be one of TorchRL's with a critic of actions, such as DDPGLoss, got "
             f"{type(loss).__name__}: write batch['signals', 'td_error'] yourself"
         )
     key = loss.tensor_keys.priority
     error = batch.get(key, None)
     if error is None:
         raise KeyError(f"{key!r} is missing in the batch: call loss(batch) first")
+    if error.numel() != batch.numel():
+        raise ValueError(
+            f"{key!r} must have one number per transition, got shape {[*error.shape]} for "
+            f"{batch.numel()}: write batch['signals', 'td_error'] yourself"
+        )
     error = error.detach().reshape(-1)
     # SAC with a network of state values writes the square, too.
     squared = isinstance(loss, _SQUARED) or (
         isinstance(loss, SACLoss) and "loss_value" in loss.out_keys
     )
     batch.set(TD_ERROR.key, error.sqrt() if squared else error.abs())
-    if isinstance(loss, _CONTINUOUS):
+    if hasattr(loss.tensor_keys, "state_action_value") and not isinstance(loss, DiscreteIQLLoss):
         slope = action_gradient(*_value_of_action(batch, loss))
         batch.set(ACTION_GRADIENT.key, action_gradient_priority(slope, order=order))
 
@@ -94,6 +109,11 @@ def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
     key = getattr(keys, "action", "action")
     inputs = batch.select(*critic.in_keys).detach()
     action = inputs[key].clone().requires_grad_()
+    # Batch normalization counts, and dropout samples, in training alone.
+    in_training = [module for module in critic.modules() if module.training]
+    critic.eval()
     with torch.enable_grad(), weights.detach().to_module(critic):
         value: Tensor = critic(inputs.set(key, action))[keys.state_action_value]
-    return value.reshape(-1), action
+    for module in in_training:
+        module.training = True
+    return value.reshape(len(action), -1).mean(-1), action
