@@ -21,6 +21,7 @@ import recurrent_td3
 import report
 import stable_baselines
 import torchrl_ddpg
+import torchrl_maddpg
 import torchrl_sac
 import torchrl_trainer
 import tune
@@ -55,6 +56,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "report": report.main,
     "stable_baselines": stable_baselines.main,
     "torchrl_ddpg": torchrl_ddpg.main,
+    "torchrl_maddpg": torchrl_maddpg.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
     "tune": tune.main,

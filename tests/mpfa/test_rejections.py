@@ -71,7 +71,7 @@ UPDATES = [
     *[
         (
             replaced(TD_ERROR, torch.ones(shape)),
-            r"'td_error' must have one .*\[4, .* 4 slots",
+            r"'td_error' must have one .*\[4, .* 4 transitions",
         )
         for shape in ((4, 2), (4, 3, 1))
     ],
@@ -99,7 +99,7 @@ def test_wrong_batch_is_rejected_and_changes_nothing(buffer, change, message):
 
 def test_times_of_writing_for_half_of_the_batch_are_rejected(buffer):
     batch = write_signals(buffer.sample())
-    with rejected(buffer, ValueError, r"written_at must have one .*shape \[2\] for 4 slots"):
+    with rejected(buffer, ValueError, r"written_at must have one .*shape \[2\] for 4 transitions"):
         buffer.sampler.update_signals(
             batch["index"],
             dict(batch["signals"].items()),

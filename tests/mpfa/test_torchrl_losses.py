@@ -257,15 +257,6 @@ def test_slope_changes_neither_a_batch_normalization_nor_the_random_numbers() ->
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_several_td_errors_of_a_transition_are_rejected() -> None:
-    rows = last_steps("DDPGLoss", torch.ones(ROWS))
-    loss = called("DDPGLoss", rows)
-    rows["td_error"] = torch.ones(ROWS, 3)
-    with pytest.raises(ValueError, match=r"'td_error' must have one number per transition, got sh"):
-        mpfa.write_signals(rows, loss)
-
-
-@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", LOSSES)
 def test_loss_that_ignores_weights_gives_one_number_per_transition_for_them(name: str) -> None:
     """Eq. (11) by hand, as the page says: the mean of weight times loss."""

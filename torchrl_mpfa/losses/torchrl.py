@@ -27,6 +27,7 @@ from torchrl.objectives import (
 from torchrl_mpfa.losses.functional import action_gradient
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+from torchrl_mpfa.storages.schema import as_path
 
 _SQUARED = (DDPGLoss, TD3Loss, TD3BCLoss, REDQLoss, IQLLoss, CQLLoss, DQNLoss, DiscreteCQLLoss)
 """Losses that write the square of the TD error."""
@@ -45,7 +46,8 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
 
     Args:
         batch: Transitions, batch size ``[B]``, that ``loss(batch)`` was called with; gets
-            ``("signals", "td_error")`` and ``("signals", "action_gradient")``, each ``[B]``.
+            ``("signals", "td_error")`` and ``("signals", "action_gradient")``, each ``[B]``; of
+            ``N`` agents ``[B, N]``.
         loss: ``DDPGLoss``, ``TD3Loss``, ``TD3BCLoss``, ``SACLoss``, ``REDQLoss``, ``CrossQLoss``,
             ``IQLLoss``, ``CQLLoss`` or ``TQCLoss``; or ``DQNLoss``, ``DistributionalDQNLoss``,
             ``DiscreteSACLoss``, ``DiscreteIQLLoss`` or ``DiscreteCQLLoss``, which have a TD error
@@ -55,7 +57,6 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
     Raises:
         KeyError: If the loss was not called with the batch.
         TypeError: If the loss is another one.
-        ValueError: If the loss has several TD errors for a transition, as of several agents.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -82,12 +83,7 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
     error = batch.get(key, None)
     if error is None:
         raise KeyError(f"{key!r} is missing in the batch: call loss(batch) first")
-    if error.numel() != batch.numel():
-        raise ValueError(
-            f"{key!r} must have one number per transition, got shape {[*error.shape]} for "
-            f"{batch.numel()}: write batch['signals', 'td_error'] yourself"
-        )
-    error = error.detach().reshape(-1)
+    error = error.detach().reshape(len(batch), -1).squeeze(1)
     # SAC with a network of state values writes the square, too.
     squared = isinstance(loss, _SQUARED) or (
         isinstance(loss, SACLoss) and "loss_value" in loss.out_keys
@@ -99,14 +95,19 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
 
 
 def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
-    """Return Q of the stored actions by the first critic, ``[B]``, and the actions ``[B, A]``."""
+    """Return Q of the stored actions by the first critic, ``[B]``, and the actions ``[B, A]``.
+
+    Of ``N`` agents ``[B, N]`` and ``[B, N, A]``.
+    """
     name = "value_network" if isinstance(loss, DDPGLoss) else "qvalue_network"
     critic, weights = getattr(loss, name), getattr(loss, f"{name}_params")
     if name == "qvalue_network":
         weights = weights[0]
     keys = loss.tensor_keys
-    # TorchRL's DDPG has no name for the action but that of the specification.
-    key = getattr(keys, "action", "action")
+    # TorchRL's DDPG has no name for the action.
+    key = getattr(keys, "action", None)
+    if key is None:
+        key = next(key for key in critic.in_keys if as_path(key)[-1] == "action")
     inputs = batch.select(*critic.in_keys).detach()
     action = inputs[key].clone().requires_grad_()
     # Batch normalization counts, and dropout samples, in training alone.
@@ -116,4 +117,4 @@ def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
         value: Tensor = critic(inputs.set(key, action))[keys.state_action_value]
     for module in in_training:
         module.training = True
-    return value.reshape(len(action), -1).mean(-1), action
+    return value.mean(-1) if value.ndim == action.ndim else value, action

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from tensordict.utils import NestedKey
@@ -25,10 +25,10 @@ from torchrl_mpfa.checks import (
 from torchrl_mpfa.fusion import FixedFusion, Fusion, checked_weights, fuse
 from torchrl_mpfa.samplers.composition import composition, one_sided
 from torchrl_mpfa.samplers.prioritized import TreeSampler
-from torchrl_mpfa.samplers.table import SignalTable, by_batch
+from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.saving import check_saved
-from torchrl_mpfa.signals import Signal, as_signals
+from torchrl_mpfa.signals import REWARD, Signal, as_signals
 
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
@@ -84,6 +84,8 @@ class SignalSampler(TreeSampler):
             probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, for any capacity.
         reward_key: Where the signed reward of a transition is read.
+        agents: Number of a transition where reward or signal has one for each agent: the largest by
+            magnitude, ``"max"``, or the ``"mean"``; None: that is an error.
 
     Raises:
         TypeError: If fusion or adjustments are of other types.
@@ -121,8 +123,13 @@ class SignalSampler(TreeSampler):
         positive_above: Level = 0.0,
         entropy_refresh: float = 1 / 256,
         reward_key: NestedKey = ("next", "reward"),
+        agents: Agents | None = None,
     ) -> None:
-        self.signals = as_signals(signals)
+        # The reward is where the transitions have it.
+        self.signals = tuple(
+            replace(signal, key=reward_key) if signal == REWARD else signal
+            for signal in as_signals(signals)
+        )
         fused = [signal.name for signal in self.signals]
         self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
         if not isinstance(self.fusion, Fusion):
@@ -145,7 +152,9 @@ class SignalSampler(TreeSampler):
             )
         self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self._counting = [adjust.counts for adjust in self.adjustments]
-        self.reward_key = reward_key
+        if agents not in (None, *get_args(Agents)):
+            raise ValueError(f"agents must be 'max', 'mean' or None, got {agents!r}")
+        self.reward_key, self.agents = reward_key, agents
         self._warned: set[str] = set()
         self._read: Tensor | None = None
         self._attached = False
@@ -171,6 +180,7 @@ class SignalSampler(TreeSampler):
             kept=[signal for signal in self.KEPT if signal not in self.signals],
             reward_key=self.reward_key,
             positive_above=self.positive_above,
+            agents=self.agents,
             device=self.device,
         )
 

@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torchrl_mpfa.adjustment import Adjustment, Level, PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion, Fusion
 from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.table import Agents
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 
 
@@ -42,6 +43,8 @@ class MPFASampler(SignalSampler):
             three weights are equal for any data.
         entropy_refresh: As in :class:`SignalSampler`.
         reward_key: Where the signed reward of a transition is read.
+        agents: Number of a transition where reward or signal has one for each agent: the largest by
+            magnitude, ``"max"``, or the ``"mean"``; None: that is an error.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -75,6 +78,7 @@ class MPFASampler(SignalSampler):
         positive_above: Level = 0.0,
         entropy_refresh: float = 1 / 256,
         reward_key: NestedKey = ("next", "reward"),
+        agents: Agents | None = None,
     ) -> None:
         super().__init__(
             max_capacity,
@@ -92,4 +96,5 @@ class MPFASampler(SignalSampler):
             positive_above=positive_above,
             entropy_refresh=entropy_refresh,
             reward_key=reward_key,
+            agents=agents,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from torchrl_mpfa.checks import (
 )
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
+
+Agents = Literal["max", "mean"]
+"""Number of a transition out of those of its agents: the largest one, or their mean."""
 
 
 class SignalTable:
@@ -42,6 +45,7 @@ class SignalTable:
         reward_key: Where the signed reward of a transition is read.
         positive_above: A transition is positive when its reward is above this, a number or
             ``"mean"``, the mean reward of the buffer.
+        agents: Number of a transition out of those of its agents, as :class:`SignalSampler` has it.
         device: Device of the tensor.
     """
 
@@ -54,10 +58,11 @@ class SignalTable:
         kept: Sequence[Signal] = (),
         reward_key: NestedKey = ("next", "reward"),
         positive_above: Level = 0.0,
+        agents: Agents | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.capacity, self.reward_key = capacity, reward_key
-        self.positive_above = positive_above
+        self.positive_above, self.agents = positive_above, agents
         fused = as_signals(signals)
         self.learned = [s for s in fused if s.known_at == "update"]
         self.written = [*(s for s in fused if s.known_at == "write"), *kept]
@@ -121,13 +126,13 @@ class SignalTable:
 
         They are on the device of the data, so that checks wait for no other device.
         """
-        reward = _column(data, self.reward_key, "reward", count)
+        reward = self._column(data, self.reward_key, "reward", count)
         rows = self.blank(count, "cpu" if reward is None else reward.device)
         if reward is not None:
             rows[:, self.reward_column] = reward
         for signal in self.written:
             same = signal.key == self.reward_key
-            value = reward if same else _column(data, signal.key, signal.name, count)
+            value = reward if same else self._column(data, signal.key, signal.name, count)
             if value is not None:
                 rows[:, self.column[signal.name]] = _not_negative(signal, value)
         return rows
@@ -145,13 +150,9 @@ class SignalTable:
             name, priority_of = signal.name, signal.priority
             if name not in signals:
                 raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
-            value = signals[name].detach().to(rows.device)
-            if value.numel() != count or value.is_complex():
-                raise ValueError(
-                    f"signal {name!r} must have one real number per transition, got {value.dtype} "
-                    f"of shape {[*value.shape]} for {count} slots"
-                )
-            value = value.reshape(-1) if live is None else value.reshape(-1)[live]
+            value = self._one_each(f"signal {name!r}", signals[name].detach(), count)
+            value = value.to(rows.device)
+            value = value if live is None else value[live]
             column = rows.select(1, self.column[name])
             if priority_of is None:
                 column.copy_(value)
@@ -200,6 +201,35 @@ class SignalTable:
             return rows, slots, None, sizes
         live = now == before
         return rows[live], slots[live], live, live.reshape(batches, -1).sum(1).tolist()
+
+    def _column(self, data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
+        """Return one finite double per transition, shape ``[count]``, or None without the entry."""
+        value = data.get(key, None)
+        if value is None:
+            return None
+        flat = self._one_each(f"{name} at {key!r}", value.detach(), count).to(torch.double)
+        low, high = bounds(flat)
+        if not (low > -math.inf and high < math.inf):
+            bad = flat[~flat.isfinite()][0].item()
+            raise ValueError(f"{name} at {key!r} must be finite, got {bad}")
+        return flat
+
+    def _one_each(self, name: str, value: Tensor, count: int) -> Tensor:
+        """Return one number per transition out of those of its agents, shape ``[count]``."""
+        if value.numel() == count and not value.is_complex():
+            return value.reshape(count)
+        several = self.agents is not None and value.ndim > 1 and len(value) == count
+        if not several or value.is_complex():
+            raise ValueError(
+                f"{name} must have one real number per transition, got {value.dtype} of shape "
+                f"{[*value.shape]} for {count} transitions: of several agents give the sampler "
+                "agents='max' or 'mean'"
+            )
+        of_agents = value.reshape(count, -1)
+        if self.agents == "mean":
+            return of_agents.mean(1)
+        # With its sign, which says whether a reward is positive.
+        return of_agents.gather(1, of_agents.abs().argmax(1, keepdim=True)).squeeze(1)
 
     def missing(self, rows: Tensor) -> str | None:
         """Return the name of the first entry known at the write that some rows lack, or None."""
@@ -283,24 +313,6 @@ def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, .
     if len(sizes) == 1:
         return [columns]
     return zip(*(column.split(list(sizes)) for column in columns), strict=True)
-
-
-def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
-    """Return one finite double per transition, shape ``[count]``, or None without the entry."""
-    value = data.get(key, None)
-    if value is None:
-        return None
-    if value.numel() != count or value.is_complex():
-        raise ValueError(
-            f"{name} at {key!r} must have one real number per transition, got {value.dtype} of "
-            f"shape {[*value.shape]} for {count} transitions"
-        )
-    flat = value.detach().reshape(count).to(torch.double)
-    low, high = bounds(flat)
-    if not (low > -math.inf and high < math.inf):
-        bad = flat[~flat.isfinite()][0].item()
-        raise ValueError(f"{name} at {key!r} must be finite, got {bad}")
-    return flat
 
 
 def _not_negative(signal: Signal, value: Tensor) -> Tensor:
