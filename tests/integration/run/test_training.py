@@ -112,7 +112,7 @@ def test_every_method_trains_every_learner_by_its_own_signals(
     run = train(tmp_path, settings)
     assert run.updates > 0
     assert all(math.isfinite(record.reward) for record in run.records)
-    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
+    weights = [value for value in run.learner.networks.state_dict().values() if value.ndim > 0]
     assert all(value.isfinite().all() for value in weights)
     signals = [signal.name for signal in settings.method.priority_signals()]
     if not signals:
@@ -293,7 +293,7 @@ def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
 
     def fail(run: TrainingRun) -> None:
         if run.actions == 35:
-            for weight in run.learner.loss.parameters():
+            for weight in run.learner.networks.parameters():
                 weight.data.fill_(math.nan)
             raise RuntimeError("something broke")
 
