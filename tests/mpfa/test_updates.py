@@ -309,6 +309,35 @@ def test_batches_are_prepared_before_the_learner_gets_them(updates):
     assert bool((written == updates).all())
 
 
+def test_prepared_batches_of_a_round_are_learned_from_at_once_by_the_program(monkeypatch):
+    found = []
+    for prepare in (None, lambda sampled: replace(sampled, batch=sampled.batch.copy())):
+        buffer, learner = make_buffer(), make_learner(compile={"disable": True})
+        log, batch = run_updates(buffer, learner, updates=UPDATES, prepare=prepare)
+        assert learner.updates == UPDATES
+        found.append((log, batch.to_dict(), learner.state_dict(), buffer.state_dict()))
+    assert same(*found)
+    # One step after the other is what the program does by itself.
+    monkeypatch.setattr(ActorCritic, "_step", None)
+    learner = make_learner(compile={"disable": True})
+    run_updates(make_buffer(), learner, updates=UPDATES, prepare=lambda sampled: sampled)
+    assert learner.updates == UPDATES
+
+
+def test_prepare_gets_the_batches_of_a_round_together_with_their_number():
+    learner, seen = Counting(), []
+
+    def prepare(sampled):
+        seen.append(sampled)
+        return sampled
+
+    run_updates(make_buffer(), learner, updates=UPDATES, prepare=prepare)
+    (sampled,) = seen
+    assert (sampled.batches, len(sampled.batch)) == (UPDATES, UPDATES * BATCH)
+    parts = [part.batch["index"] for part in sampled.parts()]
+    assert all(part.equal(each["index"]) for part, each in zip(parts, learner.batches, strict=True))
+
+
 @pytest.mark.parametrize("updates", [1, 3])
 @pytest.mark.parametrize(("home", "away"), [("cpu", DEVICE), (DEVICE, DEVICE), (DEVICE, "cpu")])
 @pytest.mark.usefixtures("second_device")

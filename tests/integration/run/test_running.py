@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch._inductor.exc import InductorError
 from torch.utils import cpp_extension
-from torchrl_mpfa.learners.base import Learner
 
 from tests.integration.tiny_runs import OVERRIDES, tiny, train
+from torchrl_mpfa import Learner
 from training.files import CHECKPOINT
 from training.run import loop
 from training.run.assembly import make_learner

@@ -259,7 +259,7 @@ def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str
 
 def test_a_checkpoint_of_another_version_or_a_damaged_one_is_rejected(tmp_path: Path) -> None:
     save_atomically({"format": 3}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 3, this version reads 6"):
+    with pytest.raises(ValueError, match=r"format 3, this version reads 7"):
         read_checkpoint(tmp_path)
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     with pytest.raises(ValueError, match=CHECKPOINT):
