@@ -90,9 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     # DDPG. The penalty keeps actions out of the flat ends of the tanh, where nothing is learned;
     # where it begins the wheels are at full speed. Delay and noise are those of TD3.
     actor = mpfa.make_actor(size, 2, width=64, saturation_limit=LIMIT)
-    loss = mpfa.make_ddpg_loss(
+    learner = mpfa.ActorCritic(
         actor,
         mpfa.make_critic(size, 2, width=64),
+        critics=1,
         gamma=0.95,
         reward_scale=0.1,
         saturation_penalty=1.0,
@@ -100,9 +101,10 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         policy_noise=0.4,
         noise_clip=0.8,
         bounds=(-1.0, 1.0),
-    )
-    learner = mpfa.ActorCriticLearner(
-        loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005, policy_delay=2
+        policy_delay=2,
+        actor_lr=LEARNING_RATE,
+        critic_lr=LEARNING_RATE,
+        tau=0.005,
     )
 
     falling = max(int(0.4 * options.actions), 1)

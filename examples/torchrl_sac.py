@@ -46,7 +46,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.record.loggers import get_logger
 
 from mpfa_envs import GENERATORS, ROOMS_TASK, Policy, evaluate, make_navigation_env, save_policy
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalSACLoss, SignalTensorStorage, Stop
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage, Stop, write_signals
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 
 HIDDEN = [128, 128]
@@ -102,7 +102,7 @@ def make_networks(env: EnvBase) -> tuple[MLP, ProbabilisticActor, ValueOperator]
 
 
 def make_buffer(replay: str) -> TensorDictReplayBuffer:
-    """TorchRL's uniform replay, or MPFA-PER, which needs the loss that writes its signals."""
+    """TorchRL's uniform replay, or MPFA-PER, whose signals ``write_signals`` writes."""
     if replay == "uniform":
         return TensorDictReplayBuffer(storage=LazyTensorStorage(CAPACITY), batch_size=BATCH_SIZE)
     # Rewards may all have one sign: what is above their mean counts as positive.
@@ -125,8 +125,7 @@ class Training:
         torch.manual_seed(settings["seed"])
         self.env = make_env(settings["task"], robots=settings["robots"], seed=settings["seed"])
         self.network, self.actor, critic = make_networks(self.env)
-        make_loss = {"uniform": SACLoss, "mpfa": SignalSACLoss}[settings["replay"]]
-        self.loss = make_loss(self.actor, critic, loss_function="l2")
+        self.loss = SACLoss(self.actor, critic, loss_function="l2")
         self.loss.make_value_estimator(gamma=0.99)
         self.targets = SoftUpdate(self.loss, tau=0.005)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=LEARNING_RATE)
@@ -137,6 +136,8 @@ class Training:
         batch = self.buffer.sample()
         losses = self.loss(batch)
         (losses["loss_qvalue"] + losses["loss_actor"] + losses["loss_alpha"]).backward()
+        if isinstance(self.buffer, SignalReplayBuffer):
+            write_signals(batch, self.loss)  # Of the critics before their step.
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.targets.step()

@@ -20,7 +20,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import DDPGLoss, SoftUpdate
 from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms import DDPGTrainer
 
@@ -32,7 +32,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     make_actor,
     make_critic,
-    make_ddpg_loss,
 )
 from torchrl_mpfa.integrations.trainer import PriorityStepper
 
@@ -75,7 +74,8 @@ def make_trainer(
     # the loss leaves out when it calls the actor.
     noise = AdditiveGaussianModule(spec, sigma_init=0.3, sigma_end=0.3)
     policy = TensorDictSequential(actor, noise)
-    loss = make_ddpg_loss(policy, critic, reward_scale=0.1)
+    loss = DDPGLoss(policy, critic, delay_actor=True)
+    loss.make_value_estimator(gamma=0.99)
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(sizes.capacity),
         sampler=MPFASampler(sizes.capacity),

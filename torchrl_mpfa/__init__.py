@@ -14,20 +14,10 @@ if TYPE_CHECKING:
     from torchrl_mpfa.fusion import Fusion as Fusion
     from torchrl_mpfa.fusion import ScaledFusion as ScaledFusion
     from torchrl_mpfa.history import ReplayHistory as ReplayHistory
-    from torchrl_mpfa.learners import ActorCriticLearner as ActorCriticLearner
-    from torchrl_mpfa.learners import DDPGLearner as DDPGLearner
-    from torchrl_mpfa.learners import DQNLearner as DQNLearner
+    from torchrl_mpfa.learners import DQN as DQN
+    from torchrl_mpfa.learners import ActorCritic as ActorCritic
     from torchrl_mpfa.learners import Learner as Learner
-    from torchrl_mpfa.learners import SACLearner as SACLearner
     from torchrl_mpfa.learners import TabularQLearner as TabularQLearner
-    from torchrl_mpfa.learners import TD3Learner as TD3Learner
-    from torchrl_mpfa.losses import SignalDDPGLoss as SignalDDPGLoss
-    from torchrl_mpfa.losses import SignalDQNLoss as SignalDQNLoss
-    from torchrl_mpfa.losses import SignalSACLoss as SignalSACLoss
-    from torchrl_mpfa.losses import SignalTD3Loss as SignalTD3Loss
-    from torchrl_mpfa.losses import make_ddpg_loss as make_ddpg_loss
-    from torchrl_mpfa.losses import make_sac_loss as make_sac_loss
-    from torchrl_mpfa.losses import make_td3_loss as make_td3_loss
     from torchrl_mpfa.losses import write_signals as write_signals
     from torchrl_mpfa.networks import make_actor as make_actor
     from torchrl_mpfa.networks import make_critic as make_critic
@@ -53,13 +43,8 @@ _NAMES = {
     "buffer": "SignalReplayBuffer",
     "fusion": "EntropyFusion FixedFusion Fusion ScaledFusion",
     "history": "ReplayHistory",
-    "learners": (
-        "ActorCriticLearner DDPGLearner DQNLearner Learner SACLearner TD3Learner TabularQLearner"
-    ),
-    "losses": (
-        "SignalDDPGLoss SignalDQNLoss SignalSACLoss SignalTD3Loss make_ddpg_loss make_sac_loss "
-        "make_td3_loss write_signals"
-    ),
+    "learners": "DQN ActorCritic Learner TabularQLearner",
+    "losses": "write_signals",
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "samplers": "MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",

@@ -25,9 +25,10 @@ from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entr
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
 _MISSING = (
-    "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
-    "SignalSACLoss write td_error and action_gradient; with another loss, or a signal of your own, "
-    "write batch[{key!r}] = ..., one number per transition"
+    "signal {name!r} is missing: the batch has no {key!r}. An update of ActorCritic writes "
+    "td_error and action_gradient, and write_signals(batch, loss) those of TorchRL's own losses; "
+    "with another loss, or a signal of your own, write batch[{key!r}] = ..., one number per "
+    "transition"
 )
 _FILE = "buffer.pt"
 """File of a dump with the state of all that has no folder."""

@@ -7,7 +7,7 @@ several batches, or gives critic and actor one each, is another callable of the 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, get_args, runtime_checkable
 
 from tensordict import TensorDictBase
@@ -20,15 +20,17 @@ _TRAINS = get_args(Trains)
 
 @dataclass(frozen=True)
 class SampledBatch:
-    """A batch of one update of a learner, and what learns from it.
+    """A batch of one update of a learner, and what learns from it; or several, sampled at once.
 
     Attributes:
-        batch: The transitions, batch size ``[B]``.
+        batch: The transitions, batch size ``[B]``, or ``[U * B]`` of several batches.
         trains: The networks that learn from them: ``"both"``, the ``"critic"`` or the ``"actor"``.
             The target networks move with the actor.
         loss_function: Distance of the critic's loss; None: the loss's own.
         new_step: True for the first batch of a training step; a delay of the actor does not count
             further batches of the same step.
+        batches: Number ``U`` of batches of one size, one after the other, each of a training step
+            of its own.
 
     Raises:
         ValueError: If ``trains`` is unknown.
@@ -43,6 +45,7 @@ class SampledBatch:
     trains: Trains = "both"
     loss_function: str | None = None
     new_step: bool = True
+    batches: int = 1
 
     def __post_init__(self) -> None:
         if self.trains not in _TRAINS:
@@ -52,6 +55,13 @@ class SampledBatch:
     def gives_signals(self) -> bool:
         """True if the update writes signals in the batch: the actor's loss has none."""
         return self.trains != "actor"
+
+    def parts(self) -> list[SampledBatch]:
+        """Return each batch by itself; tensors are views of those of all."""
+        if self.batches == 1:
+            return [self]
+        rows = self.batch.split(len(self.batch) // self.batches)
+        return [replace(self, batch=part, batches=1) for part in rows]
 
 
 @runtime_checkable

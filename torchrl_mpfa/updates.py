@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.learners.base import Learner
-from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.learners import Learner
 from torchrl_mpfa.selection import SampledBatch, Selection, one_batch
 
 Prepare = Callable[[SampledBatch], SampledBatch]
@@ -43,9 +43,10 @@ def run_updates(
         learner: The learner to train.
         select: Function from the buffer to the batches of an update.
         updates: Number of updates ``U``.
-        prepare: Applied to each batch before the learner gets it: to move it to the learner's
-            device, or to add to its rewards. It keeps the rows of the batch and their order, and
-            the learner as it is.
+        prepare: Applied to what was sampled before the learner gets it: to move it to the learner's
+            device, or to add to its rewards. It keeps the rows and their order, and the learner as
+            it is. Batches that are sampled in one call it gets together, with their number in
+            ``batches``.
 
     Returns:
         Detached values for the log, of the last update; and its last batch with signals, where the
@@ -57,7 +58,7 @@ def run_updates(
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl_mpfa import ActorCriticLearner, make_actor, make_critic, make_ddpg_loss
+        >>> from torchrl_mpfa import ActorCritic, make_actor, make_critic
         >>> from torchrl_mpfa.methods import make_replay
         >>> replay = make_replay("mpfa_per", capacity=100, batch_size=8)
         >>> end = torch.zeros(32, 1, dtype=torch.bool)
@@ -68,103 +69,73 @@ def run_updates(
         ...     "next": {**after, "done": end, "terminated": end},
         ... }
         >>> index = replay.buffer.extend(TensorDict(rows, [32]))
-        >>> learner = ActorCriticLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> learner = ActorCritic(make_actor(24, 2), make_critic(24, 2))
         >>> log, batch = run_updates(replay.buffer, learner, replay.select, updates=4)
         >>> learner.updates, batch["signals", "td_error"].shape
         (4, torch.Size([8]))
     """
     check_counts(updates=updates)
-    batch_size = buffer.batch_size
-    if batch_size is None:
+    size = buffer.batch_size
+    if size is None:
         raise ValueError("buffer must have a batch_size, got None")
-    if len(buffer) < batch_size:
+    if len(buffer) < size:
         raise ValueError(
-            f"buffer must hold at least one batch of {batch_size}, got {len(buffer)} transitions"
+            f"buffer must hold at least one batch of {size}, got {len(buffer)} transitions"
         )
-    if updates > 1 and select is one_batch and _divides(buffer):
-        return _together(buffer, learner, prepare, updates, batch_size)
-    for _ in range(updates):
-        log, batch = _one_by_one(buffer, learner, select, prepare)
-    return log, batch
-
-
-def _one_by_one(
-    buffer: TensorDictReplayBuffer, learner: Learner, select: Selection, prepare: Prepare | None
-) -> tuple[dict[str, Tensor], TensorDictBase]:
-    """Make one update, whose batches may depend on the priorities of the update before."""
+    at_once = updates if select is one_batch and _divides(buffer) else 1
     log: dict[str, Tensor] = {}
-    batch: TensorDictBase | None = None
-    for sampled in select(buffer):
-        learned, values = _learn(learner, sampled, prepare)
-        log.update(values)
-        if sampled.gives_signals:
-            batch = _at(learned, sampled.batch.device)
-            buffer.update_tensordict_priority(batch)
-    if batch is None:
+    last: TensorDictBase | None = None
+    for _ in range(updates // at_once):
+        for sampled in select(buffer) if at_once == 1 else [_sample(buffer, at_once)]:
+            home, prepared = sampled.batch.device, prepare(sampled) if prepare else sampled
+            keys = _learned_keys(buffer)
+            log.update(_learn(learner, prepared, keys))
+            if prepared.gives_signals:
+                _write_priorities(buffer, prepared, keys, home)
+                last = _at(prepared.batch[-(len(prepared.batch) // prepared.batches) :], home)
+    if last is None:
         raise ValueError("select must give the critic a batch in each update, got none")
-    return log, batch
-
-
-def _together(
-    buffer: TensorDictReplayBuffer,
-    learner: Learner,
-    prepare: Prepare | None,
-    updates: int,
-    batch_size: int,
-) -> tuple[dict[str, Tensor], TensorDictBase]:
-    """Make all updates of an iteration by one call to sample and one to write priorities."""
-    # TorchRL warns of a batch size that is not the buffer's, which is meant here.
-    buffer._warned_batch_size_conflict = True
-    sampled = buffer.sample(updates * batch_size)
-    log, learned, last = _learn_each(buffer, learner, prepare, sampled, batch_size)
-    if getattr(buffer, "takes_signals", False):
-        buffer.update_tensordict_priority(learned, batches=updates)
-    elif isinstance(buffer.sampler, PrioritizedSampler):
-        buffer.update_tensordict_priority(learned)
     return log, last
 
 
-def _learn_each(
-    buffer: TensorDictReplayBuffer,
-    learner: Learner,
-    prepare: Prepare | None,
-    sampled: TensorDictBase,
-    batch_size: int,
-) -> tuple[dict[str, Tensor], TensorDictBase, TensorDictBase]:
-    """Return values for the log, the signals of all batches, and the last batch with its own."""
-    each = getattr(learner, "update_each", None)
-    if prepare is None and each is not None and (log := each(sampled, batch_size)) is not None:
-        return log, sampled, sampled[-batch_size:]
-    batches = []
-    for part in sampled.split(batch_size):
-        batch, log = _learn(learner, SampledBatch(part), prepare)
-        batches.append(batch)
-    return log, _joined(buffer, sampled, batches), _at(batch, sampled.device)
+def _sample(buffer: TensorDictReplayBuffer, batches: int) -> SampledBatch:
+    """Sample several batches by one call."""
+    # TorchRL warns of a batch size that is not the buffer's, which is meant here.
+    buffer._warned_batch_size_conflict = True
+    return SampledBatch(buffer.sample(batches * buffer.batch_size), batches=batches)
 
 
-def _learn(
-    learner: Learner, sampled: SampledBatch, prepare: Prepare | None
-) -> tuple[TensorDictBase, dict[str, Tensor]]:
-    """Return the batch with its signals, and values for the log."""
-    if prepare is not None:
-        sampled = prepare(sampled)
-    values = learner.update(sampled)
-    return sampled.batch, values
-
-
-def _joined(
-    buffer: TensorDictReplayBuffer, sampled: TensorDictBase, batches: Sequence[TensorDictBase]
-) -> TensorDictBase:
-    """Join what the batches learned to the slots that were sampled, shape ``[U * B]``."""
-    sampler, keys = buffer.sampler, [buffer.priority_key]
-    if isinstance(sampler, SignalSampler):
-        keys = [signal.key for signal in sampler.signals if signal.known_at == "update"]
-    joined = sampled.select("index", "written_at", strict=False)
-    for key in keys:
-        values = [batch.get(key, None) for batch in batches]
+def _learn(learner: Learner, sampled: SampledBatch, keys: Sequence[NestedKey]) -> dict[str, Tensor]:
+    """Make an update with each batch, which write these entries; return values for the log."""
+    each = getattr(learner, "update_each", None) if sampled.batches > 1 else None
+    if each is not None and (log := each(sampled.batch, sampled.batches)) is not None:
+        return dict(log)
+    parts = sampled.parts()
+    for part in parts:
+        log = learner.update(part)
+    for key in keys if len(parts) > 1 else ():
+        values = [part.batch.get(key, None) for part in parts]
         if all(value is not None for value in values):
-            joined.set(key, torch.cat(values).to(sampled.device or "cpu"))
-    return joined
+            sampled.batch.set(key, torch.cat(values))
+    return log
+
+
+def _write_priorities(
+    buffer: TensorDictReplayBuffer,
+    sampled: SampledBatch,
+    keys: Sequence[NestedKey],
+    home: torch.device | None,
+) -> None:
+    """Write the priorities of what was sampled, by these entries."""
+    rows = sampled.batch.select("index", "written_at", *keys, strict=False)
+    several = {"batches": sampled.batches} if getattr(buffer, "takes_signals", False) else {}
+    buffer.update_tensordict_priority(_at(rows, home), **several)
+
+
+def _learned_keys(buffer: TensorDictReplayBuffer) -> list[NestedKey]:
+    """Return the entries that priorities are made of, which an update writes."""
+    signals = getattr(buffer.sampler, "signals", ())
+    return [*(s.key for s in signals if s.known_at == "update"), buffer.priority_key]
 
 
 def _at(batch: TensorDictBase, device: torch.device | None) -> TensorDictBase:

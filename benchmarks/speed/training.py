@@ -33,17 +33,14 @@ from benchmarks.speed.timing import (
     take_turns,
 )
 from torchrl_mpfa import (
-    ActorCriticLearner,
+    ActorCritic,
     Learner,
     MPFASampler,
     SignalReplayBuffer,
     SignalTensorStorage,
     make_actor,
     make_critic,
-    make_ddpg_loss,
-    make_td3_loss,
 )
-from torchrl_mpfa.losses import SignalLoss
 from training.run.compiling import has_compiler
 
 WIDTH = 256
@@ -70,12 +67,9 @@ class Agent:
         options: dict[str, Any] = {"width": width, **(_PLAIN if plain else {})}
         critic = make_critic(*sizes, **options, late_action=not plain)
         actor = make_actor(*sizes, **options)
-        loss: SignalLoss
-        if algorithm == "td3":
-            loss = make_td3_loss(actor, critic, bounds=(-1.0, 1.0))
-        else:
-            loss = make_ddpg_loss(actor, critic)
-        self.learner = ActorCriticLearner(loss, compile=compile)
+        noise: dict[str, Any] = {"policy_noise": 0.2, "bounds": (-1.0, 1.0)}
+        of_algorithm = noise if algorithm == "td3" else {}
+        self.learner = ActorCritic(actor, critic, compile=compile, **of_algorithm)
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
         self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
         self.buffer = SignalReplayBuffer(

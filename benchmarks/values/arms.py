@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from benchmarks.values.learning import SignalFunction, mirror
-from torchrl_mpfa.learners import ActorCriticLearner
+from torchrl_mpfa.learners import ActorCritic
 from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Method, Prioritized, Scaled
 from torchrl_mpfa.methods.mpfa import Adjusted
 
@@ -79,14 +79,14 @@ class Arm:
     """Functions that write signals of the method."""
 
 
-def both_images(learner: ActorCriticLearner, batch: TensorDictBase) -> Tensor:
+def both_images(learner: ActorCritic, batch: TensorDictBase) -> Tensor:
     """Mean TD error of a transition and of its mirror image, ``[B]``."""
     squares = []
     with torch.no_grad():
         for rows in (batch.clone(), mirror(chance=1.0)(batch.clone())):
-            _, log = learner.loss.losses(rows, trains="critic")
-            squares.append(log["td_error"].amax(0))
-    return torch.stack(squares).sqrt().mean(0) / learner.loss.reward_scale
+            error = learner.targets_of(rows) - learner.values_of(rows)
+            squares.append(error.square().amax(0))
+    return torch.stack(squares).sqrt().mean(0) / learner.reward_scale
 
 
 def _varied(base: Method, changes: dict[str, dict[str, Any]]) -> dict[str, Arm]:

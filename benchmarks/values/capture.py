@@ -125,10 +125,10 @@ def capture(source: Source) -> FrozenBuffer:
         keys = [*TRANSITION, *_ENTRIES]
         rows = as_stored(run.buffer.storage[: len(run.buffer)].select(*keys))
         env = run.robots.environment(run.schedule.world)
-        learner, loss = replace(asked.learner, **_VALUES), cast(Any, run.learner).loss
+        learner = replace(asked.learner, **_VALUES)
         returns = monte_carlo(env, run.learner.policy, gamma=learner.gamma, seed=source.seed)
         returns = returns.half().float()
-        policy = dict(loss.actor_network_params.flatten_keys(".").items())
+        policy = run.learner.policy.state_dict()
         frozen = FrozenBuffer(
             name=source.name,
             learner=learner,

@@ -16,7 +16,7 @@ from benchmarks.values.frozen import FrozenBuffer
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.checks import unknown
-from torchrl_mpfa.learners import ActorCriticLearner
+from torchrl_mpfa.learners import ActorCritic
 from torchrl_mpfa.methods import METHODS, Method, Prioritized, Replay, make_replay
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import SIGNALS_KEY
@@ -32,7 +32,7 @@ _EPISODE = 4
 GOAL = 5.0
 """A reward above this is that of a goal."""
 
-SignalFunction = Callable[[ActorCriticLearner, TensorDictBase], Tensor]
+SignalFunction = Callable[[ActorCritic, TensorDictBase], Tensor]
 """From a learner and a batch to a signal, shape ``[B]``."""
 ReplayFunction = Callable[[FrozenBuffer, torch.Generator], Replay]
 """Makes an empty replay of one's own for the transitions of a buffer."""
@@ -100,16 +100,14 @@ class FrozenPolicyLearner:
 
     def __init__(
         self,
-        learner: ActorCriticLearner,
+        learner: ActorCritic,
         policy: Mapping[str, Tensor],
         signals: Mapping[str, SignalFunction] | None = None,
     ) -> None:
         self._learner, self._signals = learner, signals or {}
         self.policy = learner.policy
-        for name in ("actor_network_params", "target_actor_network_params"):
-            weights = getattr(learner.loss, name).flatten_keys(".")
-            for key, value in policy.items():
-                weights[key].data.copy_(value)
+        for parts in (learner.networks, learner.targets):
+            parts["actor"].load_state_dict(policy)
 
     def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the critics, and of the targets when they are due."""
@@ -124,7 +122,7 @@ class FrozenPolicyLearner:
             log = learner.update(replace(sampled, trains="critic"))
         # Of a learner they move with the actor, which is not asked to learn.
         if sampled.trains != "critic" and learner.updates % learner.policy_delay == 0:
-            learner.targets.step()
+            learner.move_targets()
         return log
 
     def values(self, rows: TensorDictBase) -> Tensor:
@@ -159,22 +157,19 @@ def make_frozen_learner(
     """Critics from scratch for the policy of a buffer; they write the signals of a method."""
     torch.manual_seed(seed)
     if isinstance(method, Prioritized):
-        # What functions of their own write is nothing that the loss has to write.
+        # What functions of their own write is nothing that the learner has to write.
         known = [name for name in method.signals if name not in (signals or {})]
         method = replace(method, signals=known)
     sizes = (buffer.rows[name].shape[-1] for name in ("observation", "action"))
     learner = make_learner(buffer.learner, method, *sizes, compile=compile)
-    assert isinstance(learner, ActorCriticLearner)
+    assert isinstance(learner, ActorCritic)
     return FrozenPolicyLearner(learner, buffer.policy, signals)
 
 
-def critic_values(learner: ActorCriticLearner, rows: TensorDictBase) -> Tensor:
+def critic_values(learner: ActorCritic, rows: TensorDictBase) -> Tensor:
     """Q of each critic in units of the reward, shape ``[C, B]``: a signal may be made of it."""
-    loss: Any = learner.loss
-    asked = {"observation": rows["observation"], "action": rows["action"]}
     with torch.no_grad():
-        found = [each.outputs(asked)["state_action_value"] for each in loss.current_critics()]
-    return torch.stack(found).squeeze(-1) / loss.reward_scale
+        return learner.values_of(rows) / learner.reward_scale
 
 
 def learn(

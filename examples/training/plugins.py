@@ -168,6 +168,9 @@ class OwnSignals:
                 signal = SIGNALS[name]
                 self._functions[name] = signal() if isinstance(signal, type) else signal
 
+    def __len__(self) -> int:
+        return len(self._functions)
+
     def write(self, learner: Any, batch: TensorDictBase) -> None:
         """Write the signals in a batch, before the learner learns from it."""
         for name, function in self._functions.items():

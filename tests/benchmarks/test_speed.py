@@ -175,9 +175,9 @@ def test_updates_are_not_compared_with_sbx_where_there_is_none(monkeypatch, caps
 
 def test_both_training_steps_learn() -> None:
     agent = training.Agent(plain=False)
-    before = [p.detach().clone() for p in agent.learner.loss.parameters()]
+    before = [p.detach().clone() for p in agent.learner.networks.parameters()]
     agent.learn(training.make_transitions(1))
-    after = list(agent.learner.loss.parameters())
+    after = list(agent.learner.networks.parameters())
     assert any(not a.equal(b) for a, b in zip(after, before, strict=True))
     assert agent.buffer.sampler.weights
 

@@ -14,18 +14,15 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from torchrl.objectives import DDPGLoss
+from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
 from torchrl.trainers import Trainer
 
 from tests.integration.test_torchrl_trainer import assert_learned
 from torchrl_config import main, train
 from torchrl_mpfa import (
     MPFASampler,
-    SignalDDPGLoss,
     SignalMemmapStorage,
-    SignalSACLoss,
     SignalSampler,
-    SignalTD3Loss,
     SignalTensorStorage,
 )
 from torchrl_mpfa.integrations.trainer import PriorityStepper
@@ -68,7 +65,7 @@ def test_the_composed_pipeline_updates_the_priorities_of_what_it_replays() -> No
     buffer = trainer.replay_buffer
     assert type(buffer.sampler) is MPFASampler
     assert type(buffer.storage) is SignalTensorStorage
-    assert type(trainer.loss_module) is SignalDDPGLoss
+    assert type(trainer.loss_module) is DDPGLoss
     assert buffer.sampler.max_size == buffer.storage.max_size == 100
 
 
@@ -114,21 +111,13 @@ def test_torchrls_own_networks_fit_the_loss() -> None:
         "mlp.in_features=26",
         "mlp.out_features=1",
         "mlp.num_cells=[16]",
-        f"loss.critic={critic}",
+        f"loss.value_network={critic}",
     )
     assert_learned(trainer)
 
 
-def test_loss_and_storage_of_torchrl_learn_by_all_signals() -> None:
-    trainer = tiny(
-        "storage._target_=torchrl.data.LazyTensorStorage",
-        "loss._target_=torchrl.objectives.DDPGLoss",
-        *(f"~loss.{name}" for name in ("actor", "critic", "reward_scale")),
-        "+loss.actor_network=${policy}",
-        "+loss.value_network=${critic}",
-    )
-    assert type(trainer.loss_module) is DDPGLoss
-    assert_learned(trainer)
+def test_storage_of_torchrl_learns_by_all_signals() -> None:
+    assert_learned(tiny("storage._target_=torchrl.data.LazyTensorStorage"))
 
 
 def test_the_configuration_of_the_page_builds_a_buffer() -> None:
@@ -162,7 +151,7 @@ def parts_of(algorithm: str) -> list[str]:
         "sampler: '${sampler}', batch_size: 4}",
         "actor": f"{{_target_: torchrl_mpfa.{actor}, observation_size: 24, action_size: 2}}",
         "critic": "{_target_: torchrl_mpfa.make_critic, observation_size: 24, action_size: 2}",
-        "loss._target_": f"torchrl_mpfa.make_{algorithm}_loss",
+        "loss._target_": f"torchrl.objectives.{algorithm.upper()}Loss",
         "env.base_env": "{_target_: mpfa_envs.make_navigation_env, world: A, physics: kinematic}",
     }
     changes = {
@@ -185,22 +174,23 @@ def parts_of(algorithm: str) -> list[str]:
 
 
 def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
-    more = ["loss._target_=torchrl_mpfa.SignalTD3Loss", "+loss._partial_=true"]
+    more = ["+loss._partial_=true"]
     more += ["+loss.bounds=[-1.0,1.0]", "collector._partial_=true"]
     more += ["trainer.actor_network=${actor}", "trainer.qvalue_network=${critic}"]
     trainer = instantiate(compose(overrides=parts_of("td3") + more).trainer)
+    PriorityStepper(trainer.optimization_stepper).register(trainer)
     trainer.train()
-    assert type(trainer.loss_module) is SignalTD3Loss
+    assert type(trainer.loss_module) is TD3Loss
     assert_learned(trainer)
 
 
 def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
-    more = ["collector.policy=${actor}", "+loss.actor=${actor}", "+loss.critic=${critic}"]
-    more += ["+loss.reward_scale=0.1", "+loss.alpha_init=0.2", "trainer.log_rewards=false"]
+    more = ["collector.policy=${actor}", "+loss.actor_network=${actor}"]
+    more += ["+loss.qvalue_network=${critic}", "+loss.alpha_init=0.2", "trainer.log_rewards=false"]
     trainer = instantiate(compose(overrides=parts_of("sac") + more).trainer)
     PriorityStepper().register(trainer)
     trainer.train()
-    assert type(trainer.loss_module) is SignalSACLoss
+    assert type(trainer.loss_module) is SACLoss
     assert float(trainer.loss_module.alpha_init) == pytest.approx(0.2)
     assert_learned(trainer)
 

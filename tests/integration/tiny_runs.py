@@ -128,7 +128,7 @@ def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
     """Assert the same episodes, networks, random numbers, priorities and signals, bit by bit."""
     assert rows(resumed) == rows(whole)
     assert resumed.actions == whole.actions
-    networks = [run.learner.state_dict()["loss"] for run in (resumed, whole)]
+    networks = [run.learner.state_dict()["networks"] for run in (resumed, whole)]
     assert networks[0].keys() == networks[1].keys()
     assert all(networks[0][name].equal(networks[1][name]) for name in networks[0])
     mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.methods.replays import seeded
-from torchrl_mpfa.learners.base import make_optimizer
+from torchrl_mpfa.learners.optimized import make_optimizer
 from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
 
 

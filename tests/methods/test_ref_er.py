@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
+from tests.mpfa.learning import differentiate
 from tests.mpfa.test_updates import ACTION, OBSERVATION, make_learner, make_rows
 from tests.mpfa.transitions import restore
 from torchrl_mpfa import (
+    ActorCritic,
     make_actor,
     make_critic,
-    make_sac_loss,
     make_stochastic_actor,
 )
 from torchrl_mpfa.losses.functional import Trust, trusted_loss
@@ -121,11 +122,10 @@ def test_far_transitions_teach_neither_critic_nor_actor():
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
     replay.buffer.sampler.policy_weight = 1.0  # Nothing holds the actor.
     (draw,) = replay.select(replay.buffer)
-    loss = learner.loss
-    losses, _ = loss.losses(draw.batch)
+    losses = differentiate(learner, draw.batch)
     near = draw.batch["priority_weight"].bool()
     alone = draw.batch[near].exclude("policy_weight", "priority_weight")
-    expected, _ = loss.losses(alone)
+    expected = differentiate(learner, alone)
     for name in ("loss_value", "loss_actor"):
         scaled = expected[name] * near.sum() / len(near)
         torch.testing.assert_close(losses[name], scaled, rtol=1e-4, atol=1e-6)
@@ -206,10 +206,9 @@ def test_loss_of_the_actor_is_that_of_the_formula():
         assert float(found[row]) == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.filterwarnings("ignore:No target network updater")
 def test_sac_is_held_and_set_free_as_well():
     torch.manual_seed(0)
-    loss = make_sac_loss(
+    learner = ActorCritic(
         make_stochastic_actor(OBSERVATION, ACTION, width=8),
         make_critic(OBSERVATION, ACTION, width=8),
         signals=[],
@@ -220,8 +219,7 @@ def test_sac_is_held_and_set_free_as_well():
     for policy, behavior in ((1.0, 0.0), (0.25, 0.0), (0.0, 1.0)):
         rows["policy_weight"] = torch.full((20,), policy)
         rows["behavior_weight"] = torch.full((20,), behavior)
-        torch.manual_seed(1)
-        found.append(float(loss.actor_loss(rows)[0].detach()))
+        found.append(float(differentiate(learner, rows, trains="actor")["loss_actor"]))
     assert found[1] == pytest.approx(0.25 * found[0], rel=1e-5)
     # From actions in [-1, 1] it is 4 to 6 to the mean of the behavior.
     assert ACTION * 4**2 / 2 < found[2] < ACTION * 6**2 / 2

@@ -9,12 +9,12 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.mpfa.losses import KINDS, differentiate_at_once, make_batch, make_of
+from tests.mpfa.learning import KINDS, differentiate, make_apart, make_batch
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import ActorCriticLearner, make_actor, make_critic, make_ddpg_loss
-from torchrl_mpfa.losses import base
+from torchrl_mpfa import ActorCritic, make_actor, make_critic
+from torchrl_mpfa.learners import actor_critic
+from torchrl_mpfa.learners.networks import QUANTILES
 from torchrl_mpfa.losses.functional import LEAST_NOISE, quantile_loss
-from torchrl_mpfa.losses.stacked import QUANTILES
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
 
@@ -77,56 +77,40 @@ def test_quantiles_that_minimize_the_loss_have_the_variance_of_the_target():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
+def test_learner_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
     batch, scale = make_batch(), 0.1
-    loss = make_of(kind, signals=["information_gain", "td_error"], reward_scale=scale)
+    learner = make_apart(kind, signals=["information_gain", "td_error"], reward_scale=scale)
+    noise = learner.networks["noise"]
     with torch.no_grad():
-        for weight in loss.noise_network.parameters():
+        for weight in noise.parameters():
             weight.add_(torch.randn(weight.shape, generator=seeded(3)))
-    torch.manual_seed(0)
-    _, log = loss.losses(batch, trains="critic")
-    quantiles = loss.noise_network.outputs(batch)["state_action_value"]
+    log = differentiate(learner, batch, trains="critic")
+    quantiles = noise.outputs(batch)["state_action_value"]
     assert quantiles.shape == (6, QUANTILES)
-    squares = log["td_error"].reshape(-1, 6)
     for row in range(6):
-        errors = (squares[:, row].sqrt() / scale).tolist()
-        if kind != "ddpg":
-            target = log["target_value"][row] / scale
-            errors = (target - log["pred_value"][:, row] / scale).tolist()
+        target = log["target_value"][row] / scale
+        errors = (target - log["pred_value"][:, row] / scale).tolist()
         expected = by_hand(errors, (quantiles[row] / scale).tolist(), LEAST_NOISE)
         assert batch[SIGNAL][row].item() == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_critics_and_actor_with_quantiles_start_and_learn_as_without(kind):
-    plain = make_of(kind, signals=["td_error"])
-    loss = make_of(kind, signals=["information_gain"])
-    for each in (plain, loss):
-        torch.manual_seed(0)
-        losses, _ = each.losses(make_batch(weighted=True))
-        torch.autograd.backward([value for value in losses.values() if value.requires_grad])
-    found = dict(loss.named_parameters())
-    for name, parameter in plain.named_parameters():
+    plain = make_apart(kind, signals=["td_error"])
+    learner = make_apart(kind, signals=["information_gain"])
+    for each in (plain, learner):
+        differentiate(each, make_batch(weighted=True))
+    found = dict(learner.networks.named_parameters())
+    for name, parameter in plain.networks.named_parameters():
         assert parameter.equal(found[name])
         assert (parameter.grad is None) == (found[name].grad is None)
         if parameter.grad is not None:
             torch.testing.assert_close(found[name].grad, parameter.grad)
-    own = {name for name in found if name.startswith("noise_network.")}
-    assert own == found.keys() - dict(plain.named_parameters()).keys()
+    own = {name for name in found if name.startswith("noise.")}
+    assert own == found.keys() - dict(plain.networks.named_parameters()).keys()
     assert any(found[name].grad.abs().sum() > 0 for name in own)
-    learned = {id(each) for each in loss.critic_parameters()}
+    learned = {id(each) for each in learner.optimizer.param_groups[1]["params"]}
     assert all(id(found[name]) in learned for name in own)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_trace_writes_the_same_gain(kind):
-    loss = make_of(kind, signals=["information_gain", "action_gradient"])
-    eager, traced = make_batch(weighted=True), make_batch(weighted=True)
-    torch.manual_seed(0)
-    loss.losses(eager, defer_gradient=False)
-    torch.manual_seed(0)
-    differentiate_at_once(loss, traced)
-    torch.testing.assert_close(traced["signals"], eager["signals"])
 
 
 def test_critic_whose_last_layer_gives_more_than_q_is_rejected():
@@ -141,8 +125,8 @@ def test_critic_whose_last_layer_gives_more_than_q_is_rejected():
     keys = ["observation", "action"], ["state_action_value"]
     critic = TensorDictModule(Summed(), *keys)
     with pytest.raises(ValueError, match="whose last linear layer has one output, got Linear"):
-        make_ddpg_loss(make_actor(5, 2), critic, signals=["information_gain"])
-    assert make_ddpg_loss(make_actor(5, 2), critic).noise_network is None
+        ActorCritic(make_actor(5, 2), critic, signals=["information_gain"])
+    assert "noise" not in ActorCritic(make_actor(5, 2), critic).networks
 
 
 def noisy_share(method, *, rows=1_000, updates=300):
@@ -167,7 +151,7 @@ def noisy_share(method, *, rows=1_000, updates=300):
         )
     )
     networks = make_actor(2, 1, width=32), make_critic(2, 1, width=32)
-    learner = ActorCriticLearner(make_ddpg_loss(*networks, **loss_options(method)), critic_lr=1e-3)
+    learner = ActorCritic(*networks, **loss_options(method), critic_lr=1e-3)
     found = []
     for _ in range(updates):
         for draw in replay.select(replay.buffer):
@@ -183,7 +167,7 @@ def test_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
     assert 0.4 < noisy_share("uper") < 0.57
     # Without the noise in its denominator it does as PER.
     monkeypatch.setattr(
-        base,
+        actor_critic,
         "information_gain_priority",
         lambda error, quantiles, *, least_noise: information_gain_priority(
             error, torch.zeros_like(quantiles), least_noise=least_noise

@@ -2,16 +2,16 @@
 
 import torch
 
-from tests.mpfa.losses import make_batch, make_learner
+from tests.mpfa.learning import make_batch, make_learner
 from torchrl_mpfa.selection import SampledBatch
 
 UNTRACED = {"disable": True}
 """The function itself, where tracing takes most of the time."""
 
 
-def make_pair(name, compile=UNTRACED, *, loss=None, **options):
+def make_pair(name, compile=UNTRACED, **options):
     """An eager learner and a compiled one, with networks of the same weights."""
-    return [make_learner(name, of_loss=loss, compile=each, **options) for each in (False, compile)]
+    return [make_learner(name, compile=each, **options) for each in (False, compile)]
 
 
 def update_both(learners, seed, **given):

@@ -9,21 +9,19 @@ from torch import nn
 from torchrl.data import Bounded, Composite
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
-from torchrl.objectives import SACLoss, TD3Loss, ValueEstimators
 
-from tests.mpfa.losses import GAMMA, make_batch, parameter_gradients
-from torchrl_mpfa import (
-    ActorCriticLearner,
-    SignalTD3Loss,
-    make_actor,
-    make_critic,
-    make_sac_loss,
-    make_stochastic_actor,
-    make_td3_loss,
+from tests.mpfa.learning import (
+    differentiate,
+    gradients_of,
+    gradients_of_torchrls,
+    make_apart,
+    make_batch,
+    make_torchrls,
 )
+from torchrl_mpfa import ActorCritic, make_actor, make_critic, make_stochastic_actor
 from torchrl_mpfa.networks import ActionScale, action_bounds
 
-# TorchRL warns at every loss whose target networks nothing moves.
+# TorchRL warns at every loss of its own whose target networks nothing moves.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 LOW, HIGH = [-2.0, 0.0], [2.0, 10.0]
@@ -156,52 +154,34 @@ def test_density_integrates_to_one():
     torch.testing.assert_close(log_density[inside], expected[inside], rtol=1e-3, atol=1e-3)
 
 
-def test_td3_equals_torchrls_within_these_bounds():
-    pair = []
-    for kind, more in ((TD3Loss, {}), (SignalTD3Loss, {"importance": "torchrl"})):
-        loss = kind(
-            *networks(make_actor), action_spec=SPEC, policy_noise=2.0, noise_clip=3.0, **more
-        )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-        pair.append(loss)
-    pair[0].load_state_dict(pair[1].state_dict())
-    found = []
-    for loss in pair:
-        torch.manual_seed(1)
-        losses = loss(batch_of_seed())
-        (losses["loss_actor"] + losses["loss_qvalue"]).backward()
-        found.append((losses, parameter_gradients(loss)))
-    for key in ("loss_actor", "loss_qvalue", "target_value"):
-        torch.testing.assert_close(found[1][0][key], found[0][0][key], msg=key)
-    for name, gradient in found[1][1].items():
-        torch.testing.assert_close(gradient, found[0][1][name], msg=name)
-
-
-def batch_of_seed():
-    torch.manual_seed(9)
-    batch = batch_of()
+@pytest.mark.parametrize("kind", ["td3", "sac"])
+def test_losses_equal_torchrls_within_these_bounds(kind):
+    options, bounds = {"importance": "torchrl"}, {}
+    if kind == "td3":
+        noise = {"policy_noise": 2.0, "noise_clip": 3.0}
+        options |= {"bounds": SPEC, **noise}
+        bounds = {"bounds": None, "action_spec": SPEC, **noise}
+    maker = make_actor if kind == "td3" else make_stochastic_actor
+    learner = make_apart(kind, networks=networks(maker), **options)
+    loss = make_torchrls(kind, learner, **bounds)
+    log = differentiate(learner, batch := batch_of())
     torch.manual_seed(1)
-    return batch
-
-
-def test_sac_equals_torchrls_within_these_bounds():
-    ours = make_sac_loss(*networks(make_stochastic_actor), gamma=GAMMA, importance="torchrl")
-    theirs = SACLoss(*networks(make_stochastic_actor), loss_function="l2")
-    theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-    theirs.load_state_dict(ours.state_dict())
-    found = [loss(batch_of_seed()) for loss in (ours, theirs)]
-    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "entropy"):
-        torch.testing.assert_close(found[0][key], found[1][key], rtol=1e-4, atol=1e-4, msg=key)
+    losses = loss(batch.exclude("signals", "td_error"))
+    sum(value for key, value in losses.items() if key.startswith("loss")).backward()
+    names = {"loss_value": "loss_qvalue", "loss_actor": "loss_actor"}
+    for ours, theirs in names.items():
+        torch.testing.assert_close(log[ours], losses[theirs].detach(), rtol=1e-4, atol=1e-4)
+    gradients = gradients_of(learner)
+    for name, gradient in gradients_of_torchrls(kind, loss).items():
+        torch.testing.assert_close(gradients[name], gradient, rtol=1e-3, atol=1e-4, msg=name)
 
 
 def test_learners_train_within_bounds_and_move_no_bound():
+    # The function that would be compiled, which it is not: that takes seconds.
+    compiled = {"policy_noise": 0.2, "bounds": SPEC, "compile": {"disable": True}}
     for learner in (
-        ActorCriticLearner(
-            # The function that would be compiled, which it is not: that takes seconds.
-            make_td3_loss(*networks(make_actor), action_spec=SPEC),
-            compile={"disable": True},
-        ),
-        ActorCriticLearner(make_sac_loss(*networks(make_stochastic_actor))),
+        ActorCritic(*networks(make_actor), **compiled),
+        ActorCritic(*networks(make_stochastic_actor)),
     ):
         for _ in range(4):
             learner.update(batch_of())

@@ -7,6 +7,7 @@ import torch
 
 from tests.mpfa.transitions import make_buffer
 from torchrl_mpfa import (
+    ActorCritic,
     EntropyFusion,
     FixedFusion,
     MPFASampler,
@@ -21,7 +22,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     make_actor,
     make_critic,
-    make_sac_loss,
     make_stochastic_actor,
     run_updates,
 )
@@ -80,9 +80,9 @@ def actor(**given):
     return make_actor(3, 2, **given)
 
 
-def sac_loss(alpha_init):
+def sac(alpha):
     networks = make_stochastic_actor(3, 2, width=8), make_critic(3, 2, width=8)
-    return make_sac_loss(*networks, alpha_init=alpha_init)
+    return ActorCritic(*networks, alpha=alpha)
 
 
 def updates(count):
@@ -205,7 +205,7 @@ ROWS = [
     (actor, {"final_init": "0"}, f"final_init {NO_NUMBER} '0'"),
     (actor, {"width": 2**31}, f"width {NO_COUNT}"),
     *[(updates, {"count": count}, f"updates {NO_COUNT} {count}") for count in (0, -1, 1.5, True)],
-    (sac_loss, {"alpha_init": NAN}, f"alpha_init {NOT_POSITIVE} nan"),
+    (sac, {"alpha": NAN}, f"alpha {NOT_POSITIVE} nan"),
 ]
 
 

@@ -5,62 +5,50 @@ import copy
 import pytest
 import torch
 
-from tests.mpfa import losses
-from tests.mpfa.losses import GAMMA, make_batch
+from tests.mpfa import learning
+from tests.mpfa.learning import GAMMA, KINDS, make_batch
 from torchrl_mpfa.losses.functional import smoothing_noise
 
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
-
-KINDS = ["ddpg", "td3"]
+DETERMINISTIC = ["ddpg", "td3"]
 
 
 def make_learner(kind, average, seed=0):
     rates = {"actor_lr": 1e-2, "critic_lr": 1e-2, "tau": 0.5}
-    return losses.make_learner(kind, seed, of_loss={"target_average": average}, **rates)
+    return learning.make_learner(kind, seed, target_average=average, **rates)
 
 
 def target_of(learner, batch, seed=7):
     torch.manual_seed(seed)  # TD3 has noise in its targets.
-    with torch.no_grad():
-        return learner.loss.losses(batch, trains="critic")[1]["target_value"]
+    return learner.targets_of(batch)
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_with_one_critic_every_step_is_the_same_as_without_averaging(name):
-    averaged, plain = make_learner(name, 1), make_learner(name, 1)
+@pytest.mark.parametrize("kind", KINDS)
+def test_with_one_critic_every_step_is_the_same_as_without_averaging(kind):
+    averaged, plain = make_learner(kind, 1), make_learner(kind, 1)
     plain.end_episode = lambda: None
     for seed in range(4):
         for learner in (averaged, plain):
             torch.manual_seed(seed)
             learner.update(make_batch(seed=seed))
             learner.end_episode()
-    for mine, other in zip(
-        averaged.loss.state_dict().values(), plain.loss.state_dict().values(), strict=True
-    ):
-        assert torch.equal(mine, other)
+    for name in ("networks", "targets"):
+        states = [learner.state_dict()[name].values() for learner in (averaged, plain)]
+        assert all(torch.equal(mine, other) for mine, other in zip(*states, strict=True))
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_target_is_the_mean_over_the_present_and_the_earlier_critics(name):
-    learner, batch = make_learner(name, 3), make_batch(seed=20)
+@pytest.mark.parametrize("kind", KINDS)
+def test_target_is_the_mean_over_the_present_and_the_earlier_critics(kind):
+    learner, batch = make_learner(kind, 3), make_batch(seed=20)
     states = []
     for episode in range(5):
-        # The plain loss with the target networks of each time, by which to check.
-        present = copy.deepcopy(learner.loss.state_dict())
-        kept = [*states[-2:], present]
-        terms = []
-        for state in kept:
-            plain = make_learner(name, 1)
-            own = {k: v for k, v in state.items() if not k.startswith("past_critics")}
-            # Only the target critics are of the past: the target actor is the present one.
-            own.update({k: v for k, v in present.items() if k.startswith("target_actor")})
-            plain.loss.load_state_dict(own)
-            terms.append(next_values(name, plain, batch))
+        present = copy.deepcopy(learner.targets["critics"])
+        mean = next_values(learner, [*states[-2:], present], batch).mean(0).amin(0)
+        if kind == "sac":
+            mean = mean - learner.networks["temperature"]["log"].exp() * density(learner, batch)
         reward = batch["next", "reward"].squeeze(-1)
         goes_on = ~batch["next", "terminated"].squeeze(-1)
-        mean = torch.stack(terms).mean(0).amin(0)
         torch.testing.assert_close(
-            target_of(learner, batch.clone()), reward + GAMMA * mean * goes_on
+            target_of(learner, batch.clone()), (reward + GAMMA * mean * goes_on).detach()
         )
         learner.end_episode()
         states.append(present)
@@ -68,27 +56,45 @@ def test_target_is_the_mean_over_the_present_and_the_earlier_critics(name):
         learner.update(make_batch(seed=episode + 10))
 
 
-def next_values(name, learner, batch):
-    """Q of each target critic at the next state, shape [critics, B]."""
-    loss, after = learner.loss, batch["next"]
-    networks = loss._networks()
+def density(learner, batch):
     torch.manual_seed(7)
-    with torch.no_grad():
-        action = networks.target_actor.outputs(after)["action"]
-        if name == "td3":
-            noise = smoothing_noise(action, deviation=loss.policy_noise, limit=loss.noise_clip)
-            action = (action + noise).clamp(-1, 1)
-        given = {"observation": after["observation"], "action": action}
-        each = [critic.outputs(given) for critic in networks.target_critics]
-        return torch.stack([found["state_action_value"].squeeze(-1) for found in each])
+    return learner.policy.sample(batch["next"])[1]
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_averaged_targets_are_saved_and_loaded(name):
-    first, second = make_learner(name, 3), make_learner(name, 3, seed=1)
+@torch.no_grad()
+def next_values(learner, sets, batch):
+    """Q at the next state of each critic of each set, shape [sets, critics, B]."""
+    after = batch["next"]
+    torch.manual_seed(7)
+    if learner.stochastic:
+        action = learner.policy.sample(after)[0]
+    else:
+        action = learner.targets["actor"].outputs(after)["action"]
+    if learner.policy_noise > 0:
+        noise = smoothing_noise(action, deviation=learner.policy_noise, limit=learner.noise_clip)
+        action = (action + noise).clamp(-1, 1)
+    given = {"observation": after["observation"], "action": action}
+    values = [[q.outputs(given)["state_action_value"].squeeze(-1) for q in each] for each in sets]
+    return torch.stack([torch.stack(each) for each in values])
+
+
+@pytest.mark.parametrize("kind", DETERMINISTIC)
+def test_averaged_targets_are_saved_and_loaded(kind):
+    first, second = make_learner(kind, 3), make_learner(kind, 3, seed=1)
     for seed in range(4):
         first.update(make_batch(seed=seed))
         first.end_episode()
     second.load_state_dict(first.state_dict())
     batch = make_batch(seed=30)
     assert torch.equal(target_of(first, batch.clone()), target_of(second, batch.clone()))
+
+
+def test_earlier_critics_are_moved_by_nothing_but_the_end_of_an_episode():
+    learner = make_learner("ddpg", 2)
+    before = copy.deepcopy(learner.networks["past"].state_dict())
+    learner.update(make_batch())
+    kept = learner.networks["past"].state_dict()
+    assert all(torch.equal(value, kept[name]) for name, value in before.items())
+    learner.end_episode()
+    kept = learner.networks["past"].state_dict()
+    assert not all(torch.equal(value, kept[name]) for name, value in before.items())

@@ -9,9 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_mpfa import (
-    DQNLearner,
+    DQN,
     Learner,
-    SignalDQNLoss,
     TabularQLearner,
     make_value_network,
     run_updates,
@@ -52,10 +51,8 @@ def network(seed=0):
 @pytest.mark.parametrize("importance", ["critic", "torchrl", "none"])
 def test_update_of_dqn_is_that_of_a_plain_loop(double, importance):
     online, target = network(0), network(0)
-    loss = SignalDQNLoss(
-        network(0), double=double, gamma=GAMMA, reward_scale=SCALE, importance=importance
-    )
-    learner = DQNLearner(loss, lr=0.01, tau=0.25)
+    options = {"double": double, "reward_scale": SCALE, "importance": importance}
+    learner = DQN(network(0), gamma=GAMMA, lr=0.01, tau=0.25, **options)
     optimizer = torch.optim.Adam(online.parameters(), lr=0.01)
     for seed in range(3):
         batch = transitions(seed=seed)
@@ -87,27 +84,21 @@ def test_update_of_dqn_is_that_of_a_plain_loop(double, importance):
         assert torch.allclose(mine, theirs, atol=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore:No target network updater")
 def test_huber_loss_bends_at_one_in_units_of_the_reward():
     batch = transitions()
     batch["next", "reward"] *= 0.5
     squares = batch.clone()
     torch.manual_seed(0)
-    losses = {
-        name: SignalDQNLoss(
-            network(), loss_function=name, reward_scale=0.5, importance="none", gamma=GAMMA
-        )
-        for name in ("l2", "smooth_l1")
-    }
-    losses["l2"].losses(squares)
+    options = {"reward_scale": 0.5, "importance": "none", "gamma": GAMMA}
+    DQN(network(), loss_function="l2", **options).update(squares)
     unit = 0.5
     expected = [
         0.5 * size**2 if size < unit else unit * (size - 0.5 * unit)
         for size in (0.5 * squares["signals", "td_error"]).tolist()
     ]
     assert min(expected) < 0.5 * unit**2 < max(expected)
-    found, _ = losses["smooth_l1"].losses(batch)
-    assert float(found.detach()) == pytest.approx(sum(expected) / 12, rel=1e-4)
+    found = DQN(network(), loss_function="smooth_l1", **options).update(batch)["loss_value"]
+    assert float(found) == pytest.approx(sum(expected) / 12, rel=1e-4)
     torch.testing.assert_close(batch["signals", "td_error"], squares["signals", "td_error"])
 
 
@@ -142,7 +133,7 @@ def test_update_of_the_table_is_that_of_a_plain_dict(importance):
 
 def learners():
     return [
-        DQNLearner(SignalDQNLoss(network()), lr=0.01),
+        DQN(network(), lr=0.01),
         TabularQLearner(make_value_table(cell_of, 3, ACTIONS)),
     ]
 
@@ -185,14 +176,16 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
         with pytest.raises(KeyError, match=r"action|terminated"):
             learner.update(transitions().exclude(missing))
     with pytest.raises(ValueError, match=r"the saved learner.* lacks"):
-        learner.load_state_dict({"loss": {}, "updates": 3})
+        learner.load_state_dict({"networks": {}, "updates": 3})
     other = learners()[kind]
     other.update(transitions())
     with pytest.raises(ValueError, match="the saved learner, 'updates' must be 0, got 'some'"):
         learner.load_state_dict({**other.state_dict(), "updates": "some"})
     after = learner.state_dict()
     assert after["updates"] == 0
-    assert all(torch.equal(before["loss"][key], after["loss"][key]) for key in before["loss"])
+    assert all(
+        torch.equal(before["networks"][key], after["networks"][key]) for key in before["networks"]
+    )
 
 
 @pytest.mark.parametrize("kind", [0, 1])
@@ -241,11 +234,11 @@ def test_every_form_of_an_action_is_learned_from_alike(kind, form):
 )
 def test_bad_action_is_rejected_by_name_and_changes_nothing(kind, spoil):
     learner = learners()[kind]
-    before, batch = copy.deepcopy(learner.state_dict()["loss"]), transitions()
+    before, batch = copy.deepcopy(learner.state_dict()["networks"]), transitions()
     batch["action"] = spoil(batch["action"])
     with pytest.raises(ValueError, match=f"action must be one-hot among {ACTIONS}"):
         learner.update(batch)
-    after = learner.state_dict()["loss"]
+    after = learner.state_dict()["networks"]
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
@@ -255,15 +248,11 @@ def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
     learner.update(transitions(seed=5))  # Values that are not zero.
     batch = transitions()
     batch["steps_to_next_obs"] = torch.arange(1, 13).reshape(-1, 1)
-    targets = learner.loss.target_value_network_params if kind == 0 else None
     seen = {"observation": batch["next", "observation"]}
     with torch.no_grad():
         best = learner.policy.outputs(seen)["action"]
-        if targets is None:
-            ahead = learner.policy.outputs(seen)["action_value"]
-        else:
-            with targets.to_module(learner.loss.value_network):
-                ahead = learner.loss.value_network.outputs(seen)["action_value"]
+        ahead = (learner.targets["value"] if kind == 0 else learner.policy).outputs(seen)
+        ahead = ahead["action_value"]
         here = learner.policy.outputs({"observation": batch["observation"]})["action_value"]
     expected = []
     for row in range(12):

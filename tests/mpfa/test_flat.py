@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from tests.mpfa.compiled import UNTRACED, assert_alike, make_pair, update_both
-from tests.mpfa.losses import make_batch, make_learner
+from tests.mpfa.learning import make_batch, make_learner
 from torchrl_mpfa.learners.adam import FlatAdam
 
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 EAGER_AND_COMPILED = pytest.mark.parametrize("compile", [False, UNTRACED], ids=["eager", "program"])
 
 
@@ -55,11 +54,11 @@ def test_parameters_of_a_group_lie_in_one_tensor_and_so_do_its_targets(compile):
     learner = make_learner(compile=compile)
     for seed in range(2):
         learner.update(make_batch(seed=seed))
-    values = [*learner.loss.named_parameters(), *learner.loss.named_buffers()]
-    for prefix in ("actor_", "value_", "target_actor_", "target_value_"):
-        found = [value for name, value in values if name.startswith(prefix)]
-        assert len(found) > 5
-        assert len({value.untyped_storage().data_ptr() for value in found}) == 1
+    for parts in (learner.networks, learner.targets):
+        for name in ("actor", "critics"):
+            found = list(parts[name].parameters())
+            assert len(found) > 5
+            assert len({value.untyped_storage().data_ptr() for value in found}) == 1
 
 
 def test_program_leaves_the_steps_to_an_optimizer_that_somebody_looks_at():
@@ -80,11 +79,11 @@ def test_program_leaves_the_steps_to_an_optimizer_that_somebody_looks_at():
 def test_program_leaves_the_steps_to_an_optimizer_of_another_kind():
     learners = make_pair("ddpg")
     for learner in learners:
-        learner.optimizer = torch.optim.SGD(learner.loss.parameters(), lr=0.1)
-    before = [value.clone() for value in learners[1].loss.parameters()]
+        learner.optimizer = torch.optim.SGD(learner.networks.parameters(), lr=0.1)
+    before = [value.clone() for value in learners[1].networks.parameters()]
     with pytest.warns(UserWarning, match="steps of the SGD are not compiled"):
         update_both(learners, 0)
     for seed in range(1, 3):
         update_both(learners, seed)
     assert_alike(*learners)
-    assert not any(map(torch.equal, before, learners[1].loss.parameters()))
+    assert not any(map(torch.equal, before, learners[1].networks.parameters()))

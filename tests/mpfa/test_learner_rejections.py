@@ -7,8 +7,8 @@ from copy import deepcopy
 import pytest
 import torch
 
-from tests.mpfa import losses
-from tests.mpfa.losses import (
+from tests.mpfa import learning
+from tests.mpfa.learning import (
     KINDS,
     TRACED,
     UNTRACED,
@@ -26,7 +26,7 @@ IDS = [*KINDS, "ddpg at once"]
 
 def make_learner(name, seed=0, *, updates=3, **options):
     """A learner after some updates, so that its optimizer has a state."""
-    learner = losses.make_learner(name, seed, **options)
+    learner = learning.make_learner(name, seed, **options)
     for step in range(updates):
         learner.update(make_batch(seed=step))
     return learner
@@ -115,9 +115,9 @@ def test_loss_that_overflows_is_rejected_as_a_loss_and_not_as_a_batch():
 
 
 def weight_of(learner):
-    """Name of the first matrix among the targets of the loss."""
-    entries = learner.state_dict()["loss"].items()
-    return next(n for n, v in entries if n.startswith("target_") and getattr(v, "ndim", 0) >= 2)
+    """Name of the first matrix among the targets."""
+    entries = learner.state_dict()["targets"].items()
+    return next(name for name, value in entries if value.ndim >= 2)
 
 
 def entry_of(state, path):
@@ -137,7 +137,8 @@ FIRST, GROUP = ["optimizer", "state", 0], ["optimizer", "param_groups", 0]
     [
         ([], None, "the saved learner must be .*, got None"),
         (["optimizer"], MISSING, "the saved learner lacks 'optimizer'"),
-        (["loss"], MISSING, "the saved learner lacks 'loss'"),
+        (["networks"], MISSING, "the saved learner lacks 'networks'"),
+        (["loss"], {}, "the saved learner is of version 0.4, which is not read: finish its run"),
         (["updates"], MISSING, "the saved learner lacks 'updates'"),
         (["updates"], "3", "the saved learner, 'updates' must be 3, got '3'"),
         (["optimizer"], [], "the saved learner, 'optimizer' must be .*, got a list of 0"),
@@ -158,11 +159,15 @@ FIRST, GROUP = ["optimizer", "state", 0], ["optimizer", "param_groups", 0]
             r"'param_groups' must be a list of \d, got a list of 0",
         ),
         (["optimizer", "param_groups"], 3, r"'param_groups' must be a list of \d, got 3"),
-        (["loss", "other"], torch.zeros(1), "the saved learner, 'loss' must not have 'other'"),
-        (["loss", "WEIGHT"], MISSING, "the saved learner, 'loss' lacks 'target_"),
-        (["loss", "WEIGHT"], torch.zeros(3), r"must be .* of shape .*, got .* of shape \[3\]"),
-        (["loss", "WEIGHT"], "text", "must be torch.float32 of shape .*, got 'text'"),
-        (["loss", "WEIGHT"], SPOILED, "the saved learner must be finite, got nan in 'target_"),
+        (
+            ["targets", "other"],
+            torch.zeros(1),
+            "the saved learner, 'targets' must not have 'other'",
+        ),
+        (["targets", "WEIGHT"], MISSING, "the saved learner, 'targets' lacks '"),
+        (["targets", "WEIGHT"], torch.zeros(3), r"must be .* of shape .*, got .* of shape \[3\]"),
+        (["targets", "WEIGHT"], "text", "must be torch.float32 of shape .*, got 'text'"),
+        (["targets", "WEIGHT"], SPOILED, "the saved learner must be finite, got nan in '"),
     ],
 )
 def test_foreign_state_changes_nothing_and_is_named(name, path, value, words):
@@ -182,11 +187,7 @@ def test_foreign_state_changes_nothing_and_is_named(name, path, value, words):
 
 def test_state_of_another_kind_or_size_changes_nothing():
     learner = make_learner("ddpg")
-    wide = losses.make_learner(of_loss={"networks": make_networks(width=32)})
+    wide = learning.make_learner(networks=make_networks(width=32))
     for other in (make_learner("td3"), make_learner("sac"), wide):
-        with rejected(learner, ValueError, "the saved learner, 'loss'"):
+        with rejected(learner, ValueError, "the saved learner, 'networks'"):
             learner.load_state_dict(other.state_dict())
-
-
-def test_loss_that_is_summed_is_learned_from():
-    losses.make_learner(of_loss={"reduction": "sum"}).update(make_batch())

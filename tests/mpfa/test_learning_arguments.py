@@ -1,40 +1,25 @@
-"""Constructors of losses, learners, networks and methods: bad arguments are named with values."""
+"""Constructors of learners, networks and methods: bad arguments are named with values."""
 
 import math
-import pickle
-from copy import copy, deepcopy
 from functools import partial
-from io import BytesIO
-from itertools import product
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.objectives import ValueEstimators
-from torchrl.objectives.value import GAE
 
-from tests.mpfa.losses import (
-    BOUNDS,
-    KINDS,
-    make_discrete,
-    make_learner,
-    make_networks,
-    make_of,
-    without_shortcut,
-)
+from tests.mpfa.learning import BOUNDS, KINDS, make_discrete, make_learner, make_networks
 from torchrl_mpfa import (
-    ActorCriticLearner,
-    DQNLearner,
-    SignalDQNLoss,
+    DQN,
+    ActorCritic,
     TabularQLearner,
     make_actor,
     make_critic,
     make_stochastic_actor,
     make_value_network,
 )
-from torchrl_mpfa.learners.base import make_optimizer
+from torchrl_mpfa.learners.optimized import make_optimizer
 from torchrl_mpfa.losses.functional import distance
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.methods.geometric import GeometricSampler
@@ -48,9 +33,6 @@ from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSelection
 from torchrl_mpfa.networks import make_value_table
-
-# TorchRL warns at every loss whose target networks nothing moves.
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 NAN, INF = math.nan, math.inf
 NO_COUNT = "must be an integer from 1 to 2147483647, got"
@@ -87,10 +69,6 @@ def network_with(make, **given):
     return make(len, **given) if make is make_value_table else make(**given)
 
 
-def discrete_loss(**given):
-    return SignalDQNLoss(make_value_network(4, 5, width=8), **given)
-
-
 def of_ten(kind):
     """Make samplers of ten slots."""
     return partial(kind, 10, 0.6, 0.4)
@@ -106,8 +84,8 @@ def rows(make, argument, values, rule):
     return [(make, {argument: value}, f"{argument} {rule} {value}") for value in values]
 
 
-def rows_of_all_losses(kind):
-    make = partial(make_of, kind)
+def rows_of_all_learners(kind):
+    make = partial(make_learner, kind)
     return [
         (make, {"signals": ["novelty"]}, "signals must be among"),
         (make, {"gradient_order": 0.0}, "gradient_order must be positive, got 0.0"),
@@ -117,63 +95,46 @@ def rows_of_all_losses(kind):
         *rows(make, "saturation_limit", (-1.0,), NEGATIVE),
         *rows(make, "pal_alpha", (-0.1,), NEGATIVE),
         *rows(make, "target_average", (0,), NO_COUNT),
+        *rows(make, "critics", (0, 1.5), NO_COUNT),
         (make, {"loss_function": "l3"}, "loss_function must be one of .* got 'l3'"),
         *rows(make, "gamma", (-0.1, 1.1, NAN), NO_SHARE),
-    ]
-
-
-def rows_of_all_learners(kind):
-    make = partial(make_learner, kind)
-    return [
         *rows(make, "actor_lr", (0.0, NAN, INF), NOT_POSITIVE),
+        *rows(make, "critic_lr", (-1.0,), NOT_POSITIVE),
+        *rows(make, "critic_weight_decay", (-0.1, NAN, INF), NEGATIVE),
         *rows(make, "tau", (0.0, 1.5, NAN, INF), r"must be in \(0, 1\], got"),
         *rows(make, "policy_delay", (0,), NO_COUNT),
+        (make, {"optimizer": "sgd"}, "optimizer must be 'adam' or 'radam', got 'sgd'"),
     ]
 
 
-ddpg, td3, sac = (partial(make_of, kind) for kind in KINDS)
-noisy = partial(ddpg, policy_noise=0.1)
-ONE_OF = "one of action_spec and bounds must be"
+td3, sac = partial(make_learner, "td3"), partial(make_learner, "sac")
 SLOPE = {"signals": ["action_gradient"]}
 ROWS = [
-    *[row for kind in KINDS for row in rows_of_all_losses(kind)],
     *[row for kind in KINDS for row in rows_of_all_learners(kind)],
-    # Losses.
-    (noisy, {}, ONE_OF),
-    (noisy, {"bounds": (1.0, -1.0)}, "low < high"),
-    *rows(partial(ddpg, bounds=BOUNDS), "policy_noise", (-0.1,), NEGATIVE),
-    *rows(td3, "noise_clip", (-0.1,), NEGATIVE),
-    (td3, {"bounds": None}, ONE_OF),
-    (td3, {"action_spec": SPEC}, ONE_OF),
+    # Learners.
+    (td3, {"bounds": None}, "bounds must be an action spec, or least and greatest action, got Non"),
     (td3, {"bounds": (1.0, -1.0)}, r"bounds must be finite, low < high, got \(1.0, -1.0\)"),
-    (td3, {"bounds": None, "action_spec": Unbounded((2,))}, "action_spec must be Bounded"),
-    (sac, {"value_network": make_critic(5, 2)}, "value_network is not supported"),
-    (sac, {"skip_done_states": True}, "skip_done_states is not supported, got True"),
-    *rows(sac, "alpha_init", (0.0,), NOT_POSITIVE),
-    (discrete_loss, SLOPE, "no slope"),
-    (discrete_loss, {"signals": ["value"]}, r"signals must be among \['td_error'\], got 'value'"),
-    (discrete_loss, {"importance": "all"}, "importance must be 'critic', .* got 'all'"),
-    *rows(discrete_loss, "reward_scale", (0.0,), NOT_POSITIVE),
-    (discrete_loss, {"loss_function": "pal"}, "loss_function must be one of .* got 'pal'"),
-    *rows(discrete_loss, "gamma", (1.5,), NO_SHARE),
+    (td3, {"bounds": Unbounded((2,))}, "action_spec must be Bounded"),
+    *rows(partial(make_learner, bounds=BOUNDS), "policy_noise", (-0.1, NAN), NEGATIVE),
+    *rows(td3, "noise_clip", (-0.1,), NEGATIVE),
+    *rows(sac, "alpha", (0.0,), NOT_POSITIVE),
+    *rows(sac, "alpha_lr", (-1.0,), NEGATIVE),
+    *rows(sac, "target_entropy", (NAN, INF), "must be finite, got"),
+    (make_discrete, SLOPE, "no slope"),
+    (make_discrete, {"signals": ["value"]}, r"signals must be among \['td_error'\], got 'value'"),
+    (make_discrete, {"importance": "all"}, "importance must be 'critic', .* got 'all'"),
+    *rows(make_discrete, "reward_scale", (0.0,), NOT_POSITIVE),
+    (make_discrete, {"loss_function": "pal"}, "loss_function must be one of .* got 'pal'"),
+    *rows(make_discrete, "gamma", (1.5,), NO_SHARE),
     (
         partial(distance, torch.zeros(1), torch.zeros(1)),
         {"loss_function": "l3"},
         "loss_function must be one of .* got 'l3'",
     ),
-    # Learners.
-    *rows(partial(make_learner, "td3"), "critic_lr", (-1.0, NAN, INF), NOT_POSITIVE),
-    *rows(make_learner, "critic_weight_decay", (-0.1, NAN, INF), NEGATIVE),
-    *rows(partial(make_learner, "sac"), "alpha_lr", (0.0,), NOT_POSITIVE),
     *rows(make_discrete, "lr", (0.0,), NOT_POSITIVE),
     *rows(make_discrete, "weight_decay", (-0.1,), NEGATIVE),
     *rows(make_discrete, "tau", (0.0,), r"must be in \(0, 1\], got"),
     (partial(TabularQLearner, make_value_table(len, 3, 2)), {"lr": 0.0}, "lr must be in"),
-    (
-        make_learner,
-        {"of_loss": {"reduction": "none"}},
-        "reduction of the loss must be 'mean' or 'sum', got 'none'",
-    ),
     (partial(make_optimizer, groups=[]), {"name": "sgd"}, "optimizer must be .* got 'sgd'"),
     # Networks.
     *[
@@ -230,64 +191,72 @@ def test_arguments_of_the_table_of_networks_are_valid_but_for_the_row(make):
     network_with(make)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_networks_of_another_kind_or_order_are_rejected_and_left_as_they_are(kind):
-    actor, critic = make_networks(stochastic=kind == "sac")
-    name = "value_network" if kind == "ddpg" else "qvalue_network"
-    blind = TensorDictModule(nn.Linear(5, 1), ["observation"], ["state_action_value"])
-    order = f"actor_network and {name} are in the wrong order: actor_network reads 'action'"
-    kind_of_actor = "actor_network must be a ProbabilisticTensorDictSequential, got DirectModule"
-    swapped = (TypeError, kind_of_actor) if kind == "sac" else (ValueError, order)
-    cases = [
-        ((critic, actor), *swapped),
-        ((actor, nn.Linear(5, 1)), TypeError, f"{name} must be a TensorDictModule, got Linear"),
-        ((actor, blind), ValueError, f"{name} must read an output of actor_network"),
-    ]
-    if kind == "sac":
-        cases.append(((make_networks()[0], critic), TypeError, kind_of_actor))
-    for networks, error, words in cases:
-        with pytest.raises(error, match=words):
-            make_of(kind, networks=networks)
-    make_of(kind, networks=(actor, critic))
+def shared_by(actor, critic):
+    critic.module.first = actor.module.body
+    return actor, critic
 
 
-@pytest.mark.parametrize("kind", ["ddpg", "td3"])
-def test_average_of_critics_that_take_tensordicts_is_rejected(kind):
-    words = "target_average = 2 needs a DirectModule as critic, got TensorDictModule"
-    with pytest.raises(ValueError, match=words):
-        make_of(kind, networks=without_shortcut(*make_networks()), target_average=2)
+def blind():
+    return TensorDictModule(nn.Linear(5, 1), ["observation"], ["state_action_value"])
+
+
+def reads_before():
+    keys = ["observation", "action", "preactivation"]
+    return TensorDictModule(nn.Bilinear(5, 2, 1), keys, ["state_action_value"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_estimator_that_makes_no_targets_for_a_critic_of_actions_is_rejected(kind):
-    loss = make_of(kind)
-    kept = loss.value_estimator
-    with pytest.raises(ValueError, match=r"value_type .*GAE"):
-        loss.make_value_estimator(ValueEstimators.GAE, gamma=0.9, lmbda=0.9)
-    with pytest.raises(ValueError, match=r"value_type must make one of TD0Estimator.*, got GAE"):
-        loss.make_value_estimator(GAE(gamma=0.9, lmbda=0.9, value_network=None))
-    assert loss.value_estimator is kept
-    assert loss.value_type is ValueEstimators.TD0
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (lambda actor, critic: (critic, actor), ValueError, "actor and critic are in the wrong or"),
+        (
+            lambda actor, critic: (actor, nn.Linear(5, 1)),
+            TypeError,
+            "critic must be a TensorDictModule, got Linear",
+        ),
+        (lambda actor, critic: (len, critic), TypeError, "actor must be a TensorDictModule, got b"),
+        (lambda actor, critic: (actor, blind()), ValueError, "critic must read 'action', got"),
+        (
+            lambda actor, critic: (actor, actor),
+            ValueError,
+            "critic must read 'action', got .'observation'",
+        ),
+        (
+            lambda actor, critic: (actor, reads_before()),
+            ValueError,
+            r"critic must read no output of actor but 'action', got \['preactivation'\]",
+        ),
+    ],
+)
+def test_networks_of_another_kind_or_order_are_rejected(kind, change, error, words):
+    networks = make_networks(stochastic=kind == "sac")
+    with pytest.raises(error, match=words):
+        make_learner(kind, networks=change(*networks))
+    make_learner(kind, networks=networks)
 
 
-COPY = "cannot be copied or pickled: make another one, and have it load"
-HOW = [copy, deepcopy, pickle.dumps, partial(torch.save, f=BytesIO())]
+def test_networks_that_share_parameters_are_rejected():
+    with pytest.raises(ValueError, match="actor and critic must have parameters of their own"):
+        make_learner(networks=shared_by(*make_networks()))
+
+
+def test_critic_without_a_layer_of_one_output_has_no_quantiles():
+    critic = TensorDictModule(
+        nn.Bilinear(5, 2, 1), ["observation", "action"], ["state_action_value"]
+    )
+    with pytest.raises(ValueError, match="'information_gain' needs a critic whose last linear la"):
+        make_learner(networks=(make_networks()[0], critic), signals=["information_gain"])
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ActorCriticLearner(discrete_loss()), "loss must be a SignalLoss, got SignalDQN"),
-        (lambda: DQNLearner(make_of("ddpg")), "loss must be a SignalDQNLoss, got SignalDDPGLoss"),
+        (lambda: DQN(nn.Linear(4, 5)), "network must be a DirectModule, got Linear"),
         (lambda: TabularQLearner(make_value_network(4, 5)), "policy must be one of make_value_tab"),
-        *[
-            (partial(how, make_learner(k)), f"a ActorCriticLearner {COPY}")
-            for how, k in product(HOW, KINDS)
-        ],
-        (partial(deepcopy, make_discrete()), f"a DQNLearner {COPY}"),
     ],
 )
-def test_learner_of_another_loss_or_a_copy_is_rejected(make, words):
+def test_network_of_another_kind_is_rejected(make, words):
     with pytest.raises(TypeError, match=words):
         make()
 
@@ -299,25 +268,9 @@ def test_sampler_of_reliability_rejects_signals_without_the_td_error():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rates_by_default_are_those_of_table_1_and_a_light_decay(kind):
-    groups = ActorCriticLearner(make_of(kind)).optimizer.param_groups
+    noise = {"policy_noise": 0.2, "bounds": BOUNDS} if kind == "td3" else {}
+    learner = ActorCritic(*make_networks(stochastic=kind == "sac"), **noise)
+    groups = learner.optimizer.param_groups
     assert [group["lr"] for group in groups[:2]] == [1e-4, 1e-4]
     assert [group["weight_decay"] for group in groups[:2]] == [0.0, 1e-4]
-    assert ActorCriticLearner(make_of(kind)).policy_delay == (2 if kind == "td3" else 1)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_learner_of_a_copied_loss_is_rejected_and_one_of_its_state_learns(kind):
-    loss = make_of(kind)
-    with pytest.raises(ValueError, match="loss must be no copy: make another"):
-        ActorCriticLearner(deepcopy(loss))
-    other = make_of(kind, networks=make_networks(1, stochastic=kind == "sac"))
-    other.load_state_dict(loss.state_dict())
-    policy = ActorCriticLearner(other).policy
-    expected = loss.actor_network.state_dict()
-    assert all(torch.equal(value, expected[name]) for name, value in policy.state_dict().items())
-
-
-def test_policy_of_a_learner_of_a_copied_loss_of_values_is_the_one_that_learns():
-    learner = DQNLearner(deepcopy(discrete_loss()))
-    trained = learner.loss.value_network_params.values(True, True)
-    assert all(a is b for a, b in zip(learner.policy.parameters(), trained, strict=True))
+    assert learner.policy_delay == (2 if kind == "td3" else 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.mpfa.losses import BOUNDS, make_discrete, make_learner, make_networks
+from tests.mpfa.learning import make_discrete, make_learner, make_networks
 from tests.mpfa.transitions import make_filled
 from torchrl_mpfa import (
     EntropyFusion,
@@ -17,8 +17,6 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalTensorStorage,
     TabularQLearner,
-    make_sac_loss,
-    make_td3_loss,
 )
 from torchrl_mpfa.checks import COUNT, SHARE, check
 from torchrl_mpfa.history import ReplayHistory
@@ -31,9 +29,6 @@ from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSelection
 from torchrl_mpfa.networks import make_value_table
-
-# TorchRL warns at every loss whose target networks nothing moves.
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 HALF, THREE = np.float32(0.5), np.int64(3)
 
@@ -72,6 +67,12 @@ def recorded():
 KEPT = {
     "rates": lambda: make_learner("sac", actor_lr=HALF, alpha_lr=HALF, tau=HALF).optimizer,
     "decay and delay": lambda: make_learner("td3", critic_weight_decay=HALF, policy_delay=THREE),
+    "options": lambda: make_learner(
+        "td3", gamma=HALF, policy_noise=HALF, noise_clip=HALF, reward_scale=HALF, pal_alpha=HALF
+    ),
+    "penalty and order": lambda: make_learner(
+        "sac", saturation_penalty=HALF, saturation_limit=HALF, gradient_order=HALF, alpha=HALF
+    ),
     "lowered rates": lambda: annealed(make_learner("ddpg"), HALF).state_dict(),
     "rate of Q": lambda: make_discrete(lr=HALF, weight_decay=HALF).state_dict(),
     "rate of a table": lambda: annealed(
@@ -112,20 +113,6 @@ def test_number_of_numpy_is_kept_as_one_of_python(name):
         torch.save(kept, file)
         file.seek(0)
         torch.load(file, weights_only=True)
-
-
-@pytest.mark.parametrize("kind", ["td3", "sac"])
-def test_loss_with_numbers_of_numpy_has_the_tensors_of_one_with_floats(kind):
-    def state_of(number):
-        given = {"gamma": number}
-        if kind == "td3":
-            given |= {"bounds": BOUNDS, "policy_noise": number, "noise_clip": number}
-            return make_td3_loss(*make_networks(), **given).state_dict()
-        given |= {"alpha_init": number, "min_alpha": number, "target_entropy": number}
-        return make_sac_loss(*make_networks(stochastic=True), **given).state_dict()
-
-    expected, found = state_of(0.5), state_of(np.float64(0.5))
-    assert {k: v.dtype for k, v in found.items()} == {k: v.dtype for k, v in expected.items()}
 
 
 @pytest.mark.parametrize("wrong", [-1, 1.5, True, "3"])

@@ -11,17 +11,15 @@ from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
 from tests.mpfa.compiled import assert_alike, counting, fail_with, make_pair, update_both
-from tests.mpfa.losses import BOUNDS, make_batch, make_learner, make_networks
+from tests.mpfa.learning import BOUNDS, make_batch, make_learner, make_networks
 from torchrl_mpfa.learners import compiled as program
-
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 
 @pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
 def test_traced_program_takes_the_same_steps_and_is_made_once_for_all_rates(name):
     made = []
     options = {"target_average": 2} if name == "ddpg" else {}
-    learners = make_pair(name, counting(made), loss=options)
+    learners = make_pair(name, counting(made), **options)
     for seed in range(12):
         for learner in learners:
             learner.anneal(1.0 - seed / 12)
@@ -65,13 +63,13 @@ def test_learners_of_other_settings_learn_as_alone(options):
     first = make_learner(compile=shared)
     update_both([first], 0)
     options_again = copy.deepcopy(options)
-    second = make_learner(of_loss=options, compile=shared)
-    alone = make_learner(of_loss=options_again, compile=counting([]))
+    second = make_learner(**options, compile=shared)
+    alone = make_learner(**options_again, compile=counting([]))
     for seed in range(2):
         update_both([alone, second], seed)
     assert_alike(second, alone, rtol=0, atol=0)
-    # The discount is a tensor of the loss, which programs take as an input.
-    assert len(made) == (1 if "gamma" in options else 2)
+    # TD3 delays its actor.
+    assert len(made) == (3 if "policy_noise" in options else 2)
 
 
 def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, monkeypatch):
@@ -99,26 +97,21 @@ def test_programs_without_a_folder_of_the_user_stay_in_that_of_pytorch(tmp_path,
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == default_cache_dir()
 
 
-def change_reward(loss):
-    loss.set_keys(reward="other_reward")
-
-
-def change_gamma(loss):
-    loss.value_estimator.gamma = torch.tensor(0.5)
-
-
-@pytest.mark.parametrize("change", [change_reward, change_gamma])
-def test_program_is_made_again_for_a_loss_that_is_changed(change):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("gamma", 0.5), ("reward_scale", 3.0), ("loss_function", "smooth_l1")),
+        *(("signals", ("value",)), ("importance", "torchrl"), ("tau", 0.5)),
+    ],
+    ids=str,
+)
+def test_program_is_made_again_for_an_option_that_is_changed(name, value):
     learners = make_pair("ddpg")
     for seed in range(4):
         if seed == 2:
             for learner in learners:
-                change(learner.loss)
-        for learner in learners:
-            batch = make_batch(seed=seed, weighted=True)
-            batch["next", "other_reward"] = 5.0 * batch["next", "reward"] + 1.0
-            torch.manual_seed(seed)
-            learner.update(batch)
+                setattr(learner, name, value)
+        update_both(learners, seed)
     assert_alike(*learners)
 
 

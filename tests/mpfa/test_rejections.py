@@ -54,7 +54,7 @@ UPDATES = [
     *[
         (
             without(("signals", name)),
-            f"signal '{name}' is missing: .*'signals', '{name}'.*SignalDDPGLoss.*batch",
+            f"signal '{name}' is missing: .*'signals', '{name}'.*ActorCritic.*batch",
         )
         for name in LEARNED
     ],

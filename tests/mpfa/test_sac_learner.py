@@ -1,40 +1,20 @@
-"""ActorCriticLearner: what moves and what does not, saving, and a problem that it solves."""
+"""A learner with a stochastic actor: what moves and what does not, and a problem it solves."""
 
 import math
-from copy import deepcopy
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.mpfa import losses
-from tests.mpfa.losses import critics_of, make_batch, make_networks
+from tests.mpfa import learning
+from tests.mpfa.learning import make_batch, make_networks
 from tests.mpfa.transitions import make_buffer, seeded
-from torchrl_mpfa import ActorCriticLearner, Learner, make_sac_loss
+from torchrl_mpfa import ActorCritic, Learner
 from torchrl_mpfa.selection import SampledBatch
 
 
-def make_learner(seed=0, *, of_loss=None, **options):
-    return losses.make_learner(
-        "sac", seed, of_loss={"alpha_init": 1.0, **(of_loss or {})}, **options
-    )
-
-
-def test_target_may_average_over_earlier_critics():
-    learner = make_learner(of_loss={"target_average": 2}, critic_lr=1e-2, tau=0.5)
-    learner.end_episode()
-    states = [deepcopy(learner.loss.target_qvalue_network_params)]
-    learner.update(make_batch())
-    states.append(learner.loss.target_qvalue_network_params)
-    after = make_batch()["next", "observation"]
-    torch.manual_seed(3)
-    action, log_density, _ = learner.policy.sample({"observation": after})
-    each = [[q(after, action) for q in critics_of(learner.loss, state)] for state in states]
-    least = torch.stack([torch.stack(pair) for pair in each]).mean(0).amin(0).squeeze(-1)
-    torch.manual_seed(3)
-    found = learner.loss.value_loss(make_batch())[1]["next_state_value"]
-    expected = least - learner.loss.log_alpha.exp() * log_density
-    torch.testing.assert_close(found, expected.detach())
+def make_learner(seed=0, **options):
+    return learning.make_learner("sac", seed, **{"alpha": 1.0, **options})
 
 
 @pytest.mark.parametrize(("deviation", "falls"), [(1.0, True), (0.01, False)])
@@ -44,43 +24,37 @@ def test_temperature_falls_while_the_entropy_is_above_its_target_and_rises_below
     torch.nn.init.zeros_(head.weight)
     torch.nn.init.constant_(head.bias, math.log(math.expm1(deviation) / math.expm1(1.0)))
     log = [learner.update(make_batch(seed=seed)) for seed in range(5)]
-    assert (log[0]["entropy"] > learner.loss.target_entropy) == falls
+    assert (log[0]["entropy"] > -2.0) == falls
     assert (log[4]["alpha"] < log[0]["alpha"]) == falls
     assert log[0]["alpha"] == 1.0
 
 
 def test_fixed_temperature_stays():
-    learner = make_learner(of_loss={"fixed_alpha": True, "alpha_init": 0.2})
+    learner = make_learner(alpha=0.2, alpha_lr=0)
     for seed in range(3):
         log = learner.update(make_batch(seed=seed))
     assert float(log["alpha"]) == pytest.approx(0.2)
     assert len(learner.optimizer.param_groups) == 2
 
 
-def test_update_moves_everything_but_the_target_critics_follow_by_tau():
-    learner = make_learner(tau=0.1)
-    values = {**dict(learner.loss.named_parameters()), **dict(learner.loss.named_buffers())}
-    before = {name: value.detach().clone() for name, value in values.items()}
+def test_update_moves_everything_and_only_the_critics_have_targets():
+    learner = make_learner()
+    before = {name: p.detach().clone() for name, p in learner.networks.named_parameters()}
     batch = make_batch()
     log = learner.update(batch)
     assert not any(value.requires_grad for value in log.values())
     assert {"loss_value", "loss_actor", "loss_alpha", "alpha", "entropy"} <= set(log)
     assert set(batch["signals"].keys()) == {"td_error", "action_gradient"}
-    moved = {name for name, value in values.items() if not value.equal(before[name])}
-    targets = {name for name in values if name.startswith("target_")}
-    assert moved == {name for name, _ in learner.loss.named_parameters()} | targets
-    assert all("qvalue" in name for name in targets)
-    for name in targets:
-        expected = 0.1 * values[name.removeprefix("target_")] + 0.9 * before[name]
-        torch.testing.assert_close(values[name], expected.detach())
+    assert not any(p.equal(before[name]) for name, p in learner.networks.named_parameters())
+    assert list(learner.targets) == ["critics"]
 
 
 def test_temperature_moves_with_the_actor():
     learner = make_learner()
-    found = [learner.loss.log_alpha.item()]
+    found = [learner.networks["temperature"]["log"].item()]
     for trains in ("critic", "actor"):
         learner.update(SampledBatch(make_batch(), trains=trains))
-        found.append(learner.loss.log_alpha.item())
+        found.append(learner.networks["temperature"]["log"].item())
     assert found[0] == found[1] != found[2]
 
 
@@ -94,10 +68,8 @@ def test_temperature_has_a_rate_of_its_own_that_is_annealed_too():
 def solve_bandit(updates=300, **rates):
     """Mean distance of the greedy action from the best one, and the entropy of the policy."""
     rates = {"actor_lr": 3e-3, "critic_lr": 3e-3, "alpha_lr": 2e-2, **rates}
-    loss = make_sac_loss(
-        *make_networks(stochastic=True, size=2, width=32), alpha_init=0.1, target_entropy=-1.0
-    )
-    learner = ActorCriticLearner(loss, **rates)
+    networks = make_networks(stochastic=True, size=2, width=32)
+    learner = ActorCritic(*networks, alpha=0.1, target_entropy=-1.0, **rates)
     generator, end = seeded(), torch.ones(64, 1, dtype=torch.bool)
     for _ in range(updates):
         state, action = (torch.rand(64, 2, generator=generator) * 2 - 1 for _ in range(2))

@@ -21,7 +21,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import (
-    ActorCriticLearner,
+    ActorCritic,
     EntropyFusion,
     PositiveBoost,
     PositiveDecay,
@@ -32,7 +32,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     make_actor,
     make_critic,
-    make_ddpg_loss,
     run_updates,
 )
 from torchrl_mpfa.samplers.trees import leaves_of
@@ -366,7 +365,7 @@ def test_updates_of_an_iteration_learn_from_whole_slices(strict_length):
     data["next", "terminated"] = data["next", "done"].clone()
     buffer.extend(data)
     networks = make_actor(1, 2, width=8), make_critic(1, 2, width=8)
-    learner = ActorCriticLearner(make_ddpg_loss(*networks))
+    learner = ActorCritic(*networks)
     _, batch = run_updates(buffer, learner, updates=3)
     last = batch["next", "truncated"].squeeze(1)
     assert last[-1]

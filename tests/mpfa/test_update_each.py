@@ -4,13 +4,10 @@ import pytest
 import torch
 
 from tests.mpfa.compiled import UNTRACED, assert_alike
-from tests.mpfa.losses import make_batch, make_learner
-from torchrl_mpfa import ActorCriticLearner
+from tests.mpfa.learning import make_batch, make_learner
+from torchrl_mpfa import ActorCritic
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:No target network updater"),
-    pytest.mark.filterwarnings("ignore:steps of the RAdam are not compiled"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore:steps of the RAdam are not compiled")
 
 SIZE = len(make_batch())
 
@@ -32,7 +29,7 @@ def test_updates_of_a_round_are_those_of_one_batch_after_the_other(name, options
     for part in parts:
         log = alone.update(part)
     torch.manual_seed(3)
-    found = together.update_each(rows, SIZE)
+    found = together.update_each(rows, 5)
     assert found.keys() == log.keys()
     assert all(value.equal(log[key]) for key, value in found.items())
     assert_alike(alone, together, rtol=0.0, atol=0.0)
@@ -49,19 +46,19 @@ def test_round_with_a_batch_that_is_not_finite_ends_before_that_batch():
         alone.update(part)
     rows["next", "reward"][2 * SIZE] = torch.nan
     with pytest.raises(ValueError, match=r"batch must be finite, got nan in .*, row 0"):
-        together.update_each(rows, SIZE)
+        together.update_each(rows, len(rows) // SIZE)
     assert_alike(alone, together, rtol=0.0, atol=0.0)
 
 
 def test_round_without_a_program_changes_nothing():
     learner, untouched = make_learner("ddpg"), make_learner("ddpg")
-    assert learner.update_each(make_rows(2), SIZE) is None
+    assert learner.update_each(make_rows(2), 2) is None
     assert_alike(learner, untouched, rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize("of_class", [True, False], ids=["class", "instance"])
 def test_round_is_left_to_an_update_of_ones_own(of_class):
-    class Own(ActorCriticLearner):
+    class Own(ActorCritic):
         def update(self, sampled):
             return super().update(sampled)
 
@@ -70,5 +67,5 @@ def test_round_is_left_to_an_update_of_ones_own(of_class):
         learner.__class__ = Own
     else:
         learner.update = lambda sampled: {}
-    assert learner.update_each(make_rows(2), SIZE) is None
+    assert learner.update_each(make_rows(2), 2) is None
     assert learner.updates == 0

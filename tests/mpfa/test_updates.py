@@ -13,14 +13,13 @@ from tests.mpfa import transitions
 from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
-    ActorCriticLearner,
+    ActorCritic,
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
     SignalTensorStorage,
     make_actor,
     make_critic,
-    make_ddpg_loss,
     run_updates,
 )
 from torchrl_mpfa.learners.adam import FlatAdam
@@ -55,8 +54,7 @@ def make_learner(**options):
     torch.manual_seed(0)
     actor = make_actor(OBSERVATION, ACTION, width=8)
     critic = make_critic(OBSERVATION, ACTION, width=8)
-    loss = make_ddpg_loss(actor, critic, **options)
-    return ActorCriticLearner(loss, actor_lr=1e-2, critic_lr=1e-2)
+    return ActorCritic(actor, critic, actor_lr=1e-2, critic_lr=1e-2, **options)
 
 
 def make_buffer(count=MANY, *, device="cpu", **options):
@@ -143,20 +141,16 @@ def test_an_own_adjustment_of_one_batch_gets_them_one_by_one_and_the_same_number
     assert same(*found)
 
 
-def test_a_round_follows_a_change_of_the_loss_and_looks_for_it_once(monkeypatch):
+def test_a_round_follows_a_change_of_an_option_and_looks_for_it_once(monkeypatch):
     looks, found = [], []
     holds = FlatAdam.holds
     monkeypatch.setattr(FlatAdam, "holds", lambda self: looks.append(1) or holds(self))
     for changed in (False, True):
-        torch.manual_seed(0)
-        loss = make_ddpg_loss(
-            *(make(OBSERVATION, ACTION, width=8) for make in (make_actor, make_critic))
-        )
-        learner, buffer = ActorCriticLearner(loss, compile={"disable": True}), make_buffer()
+        learner, buffer = make_learner(compile={"disable": True}), make_buffer()
         run_updates(buffer, learner, updates=UPDATES)
         looks.clear()
-        loss.saturation_penalty = 5.0 * changed
-        loss.saturation_limit = 0.0
+        learner.saturation_penalty = 5.0 * changed
+        learner.saturation_limit = 0.0
         found.append(run_updates(buffer, learner, updates=UPDATES)[0]["loss_actor"])
         assert len(looks) == 1
     assert not same(*found)
@@ -315,6 +309,35 @@ def test_batches_are_prepared_before_the_learner_gets_them(updates):
     assert bool((written == updates).all())
 
 
+def test_prepared_batches_of_a_round_are_learned_from_at_once_by_the_program(monkeypatch):
+    found = []
+    for prepare in (None, lambda sampled: replace(sampled, batch=sampled.batch.copy())):
+        buffer, learner = make_buffer(), make_learner(compile={"disable": True})
+        log, batch = run_updates(buffer, learner, updates=UPDATES, prepare=prepare)
+        assert learner.updates == UPDATES
+        found.append((log, batch.to_dict(), learner.state_dict(), buffer.state_dict()))
+    assert same(*found)
+    # One step after the other is what the program does by itself.
+    monkeypatch.setattr(ActorCritic, "_step", None)
+    learner = make_learner(compile={"disable": True})
+    run_updates(make_buffer(), learner, updates=UPDATES, prepare=lambda sampled: sampled)
+    assert learner.updates == UPDATES
+
+
+def test_prepare_gets_the_batches_of_a_round_together_with_their_number():
+    learner, seen = Counting(), []
+
+    def prepare(sampled):
+        seen.append(sampled)
+        return sampled
+
+    run_updates(make_buffer(), learner, updates=UPDATES, prepare=prepare)
+    (sampled,) = seen
+    assert (sampled.batches, len(sampled.batch)) == (UPDATES, UPDATES * BATCH)
+    parts = [part.batch["index"] for part in sampled.parts()]
+    assert all(part.equal(each["index"]) for part, each in zip(parts, learner.batches, strict=True))
+
+
 @pytest.mark.parametrize("updates", [1, 3])
 @pytest.mark.parametrize(("home", "away"), [("cpu", DEVICE), (DEVICE, DEVICE), (DEVICE, "cpu")])
 @pytest.mark.usefixtures("second_device")
@@ -340,7 +363,7 @@ def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
     learner, buffer = Counting(), make_buffer()
 
     def prepare(draw):
-        return replace(draw, batch=TensorDict(draw.batch.to_dict(), [BATCH]))
+        return replace(draw, batch=TensorDict(draw.batch.to_dict(), [len(draw.batch)]))
 
     _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
     assert all(each.device is None for each in learner.batches)

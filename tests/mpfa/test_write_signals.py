@@ -1,60 +1,35 @@
 """Signals of TorchRL's own losses: those of ours with the same networks."""
 
-from copy import deepcopy
-
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
-from torchrl.objectives import ClipPPOLoss, DDPGLoss, DQNLoss, SACLoss, TD3Loss
+from torchrl.objectives import ClipPPOLoss, DDPGLoss, DQNLoss, TD3Loss
 
-from tests.mpfa.losses import make_batch, make_networks
-from torchrl_mpfa import make_ddpg_loss, make_sac_loss, make_td3_loss, write_signals
+from tests.mpfa.learning import (
+    KINDS,
+    differentiate,
+    make_apart,
+    make_batch,
+    make_networks,
+    make_torchrls,
+)
+from torchrl_mpfa import write_signals
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 BOUNDS = {"bounds": (-1.0, 1.0)}
 QUIET = {**BOUNDS, "policy_noise": 0.0}
 
 
-def of_torchrl(kind, actor, critic):
-    """A loss of TorchRL's with copies of the networks, the target networks too."""
-    actor, critic = deepcopy(actor), deepcopy(critic)
-    if kind == "ddpg":
-        return DDPGLoss(actor, critic, loss_function="l2")
-    if kind == "td3":
-        return TD3Loss(actor, critic, loss_function="l2", num_qvalue_nets=1, **QUIET)
-    return SACLoss(actor, critic, loss_function="l2", num_qvalue_nets=1, fixed_alpha=True)
-
-
-def of_ours(kind, actor, critic):
-    if kind == "ddpg":
-        return make_ddpg_loss(actor, critic)
-    if kind == "td3":
-        return make_td3_loss(actor, critic, num_qvalue_nets=1, **QUIET)
-    return make_sac_loss(actor, critic, num_qvalue_nets=1, fixed_alpha=True)
-
-
-def give_weights(theirs, ours, kind):
-    """Give a loss of TorchRL's the critics of ours, which are made again for several."""
-    name = "value_network" if kind == "ddpg" else "qvalue_network"
-    for prefix in ("", "target_"):
-        into, source = (getattr(loss, f"{prefix}{name}_params").data for loss in (theirs, ours))
-        into.update_(source)
-
-
-@pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("order", [1.0, 2.0])
-def test_signals_are_those_of_our_loss_with_the_same_networks(kind, order):
-    actor, critic = make_networks(stochastic=kind == "sac")
-    ours, theirs = of_ours(kind, actor, critic), of_torchrl(kind, actor, critic)
-    theirs.make_value_estimator(gamma=0.99)
-    ours.gradient_order = order
-    give_weights(theirs, ours, kind)
+def test_signals_are_those_of_our_learner_with_the_same_networks(kind, order):
+    learner = make_apart(kind, gradient_order=order)
+    theirs = make_torchrls(kind, learner)
     first, second = make_batch(32), make_batch(32)
-    torch.manual_seed(0)
-    ours(first)
-    torch.manual_seed(0)
+    differentiate(learner, first)
+    torch.manual_seed(1)
     theirs(second)
     write_signals(second, theirs, order=order)
     for name in ("td_error", "action_gradient"):
@@ -81,7 +56,7 @@ def test_td_error_of_a_pair_of_critics_is_the_larger_one_and_the_slope_the_first
 
 
 def test_writing_signals_leaves_gradients_and_graph_as_they_were():
-    loss = of_torchrl("ddpg", *make_networks())
+    loss = DDPGLoss(*make_networks(), loss_function="l2")
     loss.make_value_estimator(gamma=0.99)
     plain, written = make_batch(8), make_batch(8)
     sum(value for name, value in loss(plain).items() if name.startswith("loss")).backward()
@@ -111,7 +86,7 @@ def test_dqn_has_a_td_error_alone():
 
 
 def test_a_batch_that_the_loss_has_not_seen_and_another_loss_are_rejected():
-    loss = of_torchrl("ddpg", *make_networks())
+    loss = DDPGLoss(*make_networks(), loss_function="l2")
     with pytest.raises(KeyError, match=r"'td_error' is missing in the batch: call loss\(batch\)"):
         write_signals(make_batch(4), loss)
     with pytest.raises(TypeError, match=r"such as DDPGLoss, got ClipPPOLoss: write batch\["):

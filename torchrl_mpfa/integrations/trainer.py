@@ -6,6 +6,7 @@ with a stepper skips that stage in silence, and all transitions keep the priorit
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -23,10 +24,10 @@ class PriorityStepper(OptimizationStepper):
     """An optimization stepper that updates the priorities of each batch after its step.
 
     Another stepper takes the step itself, by default TorchRL's: all losses in one backward pass,
-    one step of the trainer's optimizer. Target networks stay with the trainer. The loss writes the
-    signals in the batch, and ``replay_buffer.update_tensordict_priority`` reads them. For a loss of
-    TorchRL's own, :func:`~torchrl_mpfa.write_signals` does, with the slope of the critic after the
-    step.
+    one step of the trainer's optimizer. Target networks stay with the trainer. For a loss of
+    TorchRL's own :func:`~torchrl_mpfa.write_signals` writes the signals in the batch, with the
+    slope of the critic after the step; another loss writes its own. Then
+    ``replay_buffer.update_tensordict_priority`` reads them, and not before.
 
     Args:
         stepper: Stepper that takes the step; by default
@@ -34,11 +35,11 @@ class PriorityStepper(OptimizationStepper):
 
     Raises:
         TypeError: If ``stepper`` is not an optimization stepper.
-        ValueError: If it updates priorities already.
 
     Examples:
         A trainer takes it as ``optimization_stepper``, where it has such an argument, or else by
-        ``PriorityStepper().register(trainer)``.
+        ``PriorityStepper().register(trainer)``; one with a stepper of its own, as ``TD3Trainer``,
+        by ``PriorityStepper(trainer.optimization_stepper).register(trainer)``.
 
         >>> PriorityStepper().updates_replay_priority
         True
@@ -50,8 +51,6 @@ class PriorityStepper(OptimizationStepper):
         stepper = DefaultOptimizationStepper() if stepper is None else stepper
         if not isinstance(stepper, OptimizationStepper):
             raise TypeError(f"stepper must be an OptimizationStepper, got {_name(stepper)}")
-        if _declares_updates(stepper):
-            raise ValueError(f"stepper must not update priorities itself, got {_name(stepper)}")
         self.stepper = stepper
         self.priority_updates = 0
         """Number of batches whose priorities were updated."""
@@ -76,7 +75,7 @@ class PriorityStepper(OptimizationStepper):
             KeyError: If the loss did not write a signal that the sampler needs.
         """
         replay_buffer = buffer_of(trainer)
-        metrics = self.stepper.step(trainer, sub_batch)
+        metrics = self.stepper.step(_WithoutPriorities(trainer), sub_batch)
         if sub_batch.get(TD_ERROR.key, None) is None and isinstance(trainer.loss_module, SUPPORTED):
             write_signals(sub_batch, trainer.loss_module)
         replay_buffer.update_tensordict_priority(sub_batch)
@@ -87,7 +86,8 @@ class PriorityStepper(OptimizationStepper):
 
     def register(self, trainer: Trainer, name: str = "optimization_stepper") -> None:
         """Make it the optimization stepper of a trainer; ``name`` is that of the inner state."""
-        self.stepper.register(trainer, name)
+        if getattr(trainer, "optimization_stepper", None) is not self.stepper:
+            self.stepper.register(trainer, name)
         self._trainer = trainer
         trainer.optimization_stepper = self
 
@@ -109,8 +109,15 @@ def buffer_of(trainer: Trainer) -> Any:
     return replay_buffer
 
 
-def _declares_updates(stepper: OptimizationStepper) -> bool:
-    return bool(getattr(stepper, "updates_replay_priority", False))
+class _WithoutPriorities:
+    """A trainer for a stepper that would update priorities, without signals, as TD3's does."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+        self.replay_buffer = SimpleNamespace(update_tensordict_priority=lambda batch: None)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._trainer, name)
 
 
 def _name(thing: object) -> str:

@@ -1,22 +1,15 @@
-"""Learners: networks, loss, optimizers and target networks behind one ``update``."""
+"""Learners: networks, losses, one optimizer and target networks behind one ``update``."""
 
-from torchrl_mpfa.learners.base import (
-    ActorCriticLearner,
-    DDPGLearner,
-    Learner,
-    MultiTensorSoftUpdate,
-    SACLearner,
-    TD3Learner,
-)
-from torchrl_mpfa.learners.dqn import DQNLearner, TabularQLearner
+from typing import Any
 
-__all__ = [
-    "ActorCriticLearner",
-    "DDPGLearner",
-    "DQNLearner",
-    "Learner",
-    "MultiTensorSoftUpdate",
-    "SACLearner",
-    "TD3Learner",
-    "TabularQLearner",
-]
+from torchrl_mpfa.lazy import find
+from torchrl_mpfa.learners.actor_critic import ActorCritic
+from torchrl_mpfa.learners.dqn import DQN, TabularQLearner
+from torchrl_mpfa.learners.optimized import Learner
+
+__all__ = ["DQN", "ActorCritic", "Learner", "TabularQLearner"]
+
+
+def __getattr__(name: str) -> Any:
+    """Say of a name that went what replaces it."""
+    return find(__name__, name, {})

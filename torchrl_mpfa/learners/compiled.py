@@ -14,7 +14,6 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from operator import is_
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +30,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_mpfa.learners.adam import FlatAdam, FlatGroup
 from torchrl_mpfa.selection import Trains
+from torchrl_mpfa.signals import SIGNALS_KEY
 
 Entries = dict[NestedKey, Tensor]
 Call = Callable[..., list[Tensor]]
@@ -75,15 +75,15 @@ class CompiledUpdate:
 
     def __init__(self, learner: Any, compile: dict[str, Any]) -> None:
         _keep_programs()
-        self._learner, self._loss = learner, learner.loss
+        self._learner = learner
         self._arguments = compile
         self._programs: dict[Any, Program | None] = {}
         self._warned = False
-        self._device = next(self._loss.parameters()).device.type
-        self._held: list[Any] = []
-        self._options: tuple[Any, ...] = ()
-        self._written: set[NestedKey] = set()
-        """Entries that the loss writes, which a program does not read."""
+        self._device = next(learner.networks.parameters()).device.type
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy has other tensors, and a program cannot be pickled.
+        return {**vars(self), "_programs": {}}
 
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
@@ -140,7 +140,8 @@ class CompiledUpdate:
 
     def _entries(self, batch: TensorDictBase) -> Entries:
         """Return what a program may read, each tensor in the one layout that programs are for."""
-        return {k: v.contiguous() for k, v in _leaves(batch) if k not in self._written}
+        written = {"td_error", *((SIGNALS_KEY, name) for name in self._learner.signals)}
+        return {k: v.contiguous() for k, v in _leaves(batch) if k not in written}
 
     def _program_for(
         self, entries: Entries, size: torch.Size, trains: Trains, loss_function: str | None
@@ -150,7 +151,8 @@ class CompiledUpdate:
             self._device
         )
         steps = _records_steps(self._learner.optimizer)
-        form = trains, loss_function, precision, steps, self._options, *map(_form, entries.items())
+        options = _options(self._learner)
+        form = trains, loss_function, precision, steps, options, *map(_form, entries.items())
         if form not in self._programs:
             self._programs[form] = self._make(entries, size, trains, loss_function, steps)
         return self._programs[form]
@@ -176,22 +178,6 @@ class CompiledUpdate:
         """Have programs made again: the tensors of the learner lie elsewhere now."""
         self._programs.clear()
 
-    def read_options(self) -> None:
-        """Read the constants of a trace again if one may have changed: options, keys, estimator."""
-        loss, estimator = self._loss, self._loss.value_estimator
-        parts = loss, estimator, loss.tensor_keys, estimator.tensor_keys
-        held = [estimator, *estimator._buffers.values()]
-        for part in parts:
-            held += vars(part).values()
-        if len(held) == len(self._held) and all(map(is_, held, self._held)):
-            return
-        self._held = held
-        plain = [value for value in held if isinstance(value, (bool, int, float, str, tuple))]
-        self._options = estimator, *map(id, estimator.buffers()), *plain
-        keys = loss.tensor_keys
-        self._written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
-        self._written |= {keys.value_signal, keys.information_gain_signal}
-
     def _make(
         self,
         entries: Entries,
@@ -200,16 +186,12 @@ class CompiledUpdate:
         loss_function: str | None,
         steps: bool,
     ) -> Program | None:
-        learner, loss = self._learner, self._loss
+        learner = self._learner
         optimizer, stepped = learner.optimizer, None
-        # Views of parameters that lie elsewhere now are taken again, and before a trace, which
-        # cannot hold that modules are copied.
-        loss.forget_networks()
-        loss._networks()
         learner.clear_gradients()
-        state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
-        parameters = [value for value in state.values() if value.requires_grad]
-        tensors = list(state.values())
+        parameters = [value for value in learner.networks.parameters() if value.requires_grad]
+        parts = learner.networks, learner.targets
+        tensors = [v for part in parts for v in (*part.parameters(), *part.buffers())]
         if steps:
             tensors += [each for group in optimizer.flat_groups for each in group.tensors()]
         moved: list[Tensor] = []
@@ -234,7 +216,7 @@ class CompiledUpdate:
                 for group in stepped:
                     group.record_step(finite)
                 if trains != "critic":
-                    learner.targets.record_step(finite)
+                    learner.record_targets(finite)
             return [*given, finite]
 
         # Recorded with real numbers, as a loss may make tensors that it keeps; but with none of the
@@ -248,8 +230,8 @@ class CompiledUpdate:
             if "data-dependent" not in str(error):
                 raise
             self._warn(
-                f"updates are not compiled: operations of the {type(loss).__name__} depend on the "
-                f"numbers in a batch ({error})"
+                f"updates are not compiled: operations of the {type(learner).__name__} depend on "
+                f"the numbers in a batch ({error})"
             )
             return None
         finally:
@@ -350,6 +332,12 @@ def _write(batch: TensorDictBase, key: NestedKey, value: Tensor) -> None:
 def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
     key, value = entry
     return key, value.shape, value.dtype, value.device
+
+
+def _options(learner: Any) -> tuple[Any, ...]:
+    """Return the constants of a record: what of a learner is no tensor, and does not count."""
+    plain = (bool, int, float, str, tuple)
+    return tuple(v for k, v in vars(learner).items() if isinstance(v, plain) and k != "updates")
 
 
 def _records_steps(optimizer: Any) -> bool:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.base import OptimizedLearner, OptimizerName
 from torchrl_mpfa.learners.checks import check_alike, check_losses
-from torchrl_mpfa.losses.dqn import SignalDQNLoss
-from torchrl_mpfa.losses.functional import bootstrap_target, read_choices
+from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
+from torchrl_mpfa.losses.functional import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
+from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.selection import SampledBatch, Trains
-from torchrl_mpfa.signals import TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+
+_DISTANCES = ("l1", "l2", "smooth_l1")
 
 
 def _whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
@@ -33,76 +37,123 @@ def _whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> Ten
     return sampled.batch
 
 
-class DQNLearner(OptimizedLearner):
+class DQN(OptimizedLearner):
     r"""DQN (Mnih et al. 2015, https://doi.org/10.1038/nature14236), double by default.
 
+    A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|`, shape ``[B]``. There is no signal
+    of Eq. (14): a choice among actions has no slope. The loss is Eq. (11),
+    :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2`.
+
     Args:
-        loss: The loss with its network in it.
+        network: From observations to ``"action_value"`` and a one-hot ``"action"``, such as
+            :func:`~torchrl_mpfa.make_value_network` gives. It is held, not copied.
+        signals: ``["td_error"]``, or none.
+        importance: ``"critic"``: weights divided by the batch size (Eq. 11); ``"torchrl"``: by
+            their sum; ``"none"``.
+        reward_scale: Factor of the rewards in the loss; the signal is divided by it again.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, which bends at an error of one in
+            units of the environment's reward.
+        double: True to take the next action from the network, and not from the target network
+            (van Hasselt et al. 2016, https://arxiv.org/abs/1509.06461).
+        gamma: Discount, in [0, 1].
         lr: Learning rate.
         weight_decay: L2 decay of the weights.
         tau: Share of the network in the target network's step.
         optimizer: ``"adam"`` or ``"radam"``.
 
     Raises:
-        TypeError: If the loss is another learner's, or its network no :class:`DirectModule`.
+        TypeError: If the network is no :class:`DirectModule`.
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> from torchrl_mpfa import SignalDQNLoss, make_value_network
-        >>> learner = DQNLearner(SignalDQNLoss(make_value_network(24, 7)))
+        >>> from torchrl_mpfa import make_value_network
+        >>> learner = DQN(make_value_network(24, 7))
         >>> learner.policy.outputs({"observation": torch.rand(5, 24)})["action"].sum(-1).tolist()
         [1, 1, 1, 1, 1]
     """
 
     def __init__(
         self,
-        loss: SignalDQNLoss,
+        network: DirectModule,
         *,
+        signals: Sequence[str] = (TD_ERROR.name,),
+        importance: str = "critic",
+        reward_scale: float = 1.0,
+        loss_function: str = "l2",
+        double: bool = True,
+        gamma: float = 0.99,
         lr: float = 1e-4,
         weight_decay: float = 0.0,
         tau: float = 0.01,
         optimizer: OptimizerName = "adam",
     ) -> None:
-        if not isinstance(loss, SignalDQNLoss):
-            raise TypeError(f"loss must be a SignalDQNLoss, got {type(loss).__name__}")
-        lr = check(POSITIVE, lr=lr)
-        weight_decay = check(NOT_NEGATIVE, weight_decay=weight_decay)
-        network = loss.value_network
         if not isinstance(network, DirectModule):
             raise TypeError(f"network must be a DirectModule, got {type(network).__name__}")
-        parameters = list(loss.value_network_params.values(True, True))
-        groups = [{"params": parameters, "lr": lr, "weight_decay": weight_decay}]
-        super().__init__(loss, groups, optimizer, tau)
-        # A copy that holds the loss's own tensors, not copies of them.
-        self.policy: DirectModule = copy.deepcopy(network)
-        loss.value_network_params.to_module(self.policy)
+        for name in signals:
+            if name == ACTION_GRADIENT.name:
+                raise ValueError(
+                    f"signals must not have {name!r}: values of separate actions have no slope. "
+                    "Leave it out, as with signals=['reward', 'td_error']"
+                )
+            if name != TD_ERROR.name:
+                raise ValueError(f"signals must be among ['td_error'], got {name!r}")
+        if loss_function not in _DISTANCES:
+            raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
+        self.signals, self.loss_function, self.double = tuple(signals), loss_function, double
+        self.importance = check(IMPORTANCE, importance=importance)
+        self.reward_scale, lr = check(POSITIVE, reward_scale=reward_scale, lr=lr)
+        self.gamma = check(SHARE, gamma=gamma)
+        decay = check(NOT_NEGATIVE, weight_decay=weight_decay)
+        groups = [{"params": [*network.parameters()], "lr": lr, "weight_decay": decay}]
+        target = copy.deepcopy(network).requires_grad_(False)
+        networks, targets = nn.ModuleDict({"value": network}), nn.ModuleDict({"value": target})
+        super().__init__(networks, targets, groups, optimizer, tau)
+        self.policy: DirectModule = network
 
     def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """Step the network and the target network.
 
         Args:
             sampled: The batch; one of size ``[B]`` stands for ``SampledBatch(batch)``. It gets the
-                signal of Eq. (13).
+                signal of Eq. (13). Actions are one-hot, ``[B, K]``, or numbers, ``[B, 1]``.
 
         Returns:
             Detached values for the log.
 
         Raises:
             KeyError: If the batch lacks an entry.
-            ValueError: If the loss is not finite, or the batch is for an actor or critic alone;
-                nothing is changed then.
+            ValueError: If the loss is not finite, the actions have neither form, or the batch is
+                for an actor or critic alone; nothing is changed then.
         """
-        log = self._step(_whole_batch(sampled, self))
-        self.updates += 1
-        return log
+        return super().update(_whole_batch(sampled, self))
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set the gradients and return the log."""
-        loss, log = self.loss.losses(batch)
+        online, target = self.policy, self.targets["value"]
+        states, after = self._states_of(batch), self._states_of(batch["next"])
+        values = online.outputs(states)["action_value"]
+        number = read_choices(batch["action"], values.shape[-1], batch)
+        value = values.gather(-1, number.unsqueeze(-1)).squeeze(-1)
+        with torch.no_grad():
+            choice = (online if self.double else target).outputs(after)["action"]
+            ahead = (target.outputs(after)["action_value"] * choice).sum(-1)
+            aim = target_of(batch, ahead, gamma=self.gamma, reward_scale=self.reward_scale)
+        losses = distance(value, aim, self.loss_function, unit=self.reward_scale)  # Eq. (4)
+        weight = batch.get("priority_weight", None)
+        if weight is not None and self.importance != "none":
+            weight = weight.reshape(-1)
+            losses = losses * weight / (weight.mean() if self.importance == "torchrl" else 1.0)
+        loss = losses.mean()  # Eq. (11)
         loss.backward()
-        return {**log, "loss_value": loss}
+        error = (aim - value).detach()
+        if self.signals:
+            batch.set(TD_ERROR.key, td_error_priority(error) / self.reward_scale)  # Eq. (13)
+        return {"loss_value": loss.detach(), "td_error": error.square()}
+
+    def _states_of(self, source: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Read the inputs of the network, without gradients."""
+        return {key: source[key].detach() for key in self.policy.in_keys}
 
 
 class TabularQLearner:
@@ -165,7 +216,7 @@ class TabularQLearner:
         """Move the entries that the transitions of a batch belong to.
 
         Args:
-            sampled: As in :meth:`DQNLearner.update`; actions are one-hot, ``[B, K]``, or numbers.
+            sampled: As in :meth:`DQN.update`; actions are one-hot, ``[B, K]``, or numbers.
 
         Returns:
             Values for the log.
@@ -180,14 +231,7 @@ class TabularQLearner:
         action = read_choices(batch["action"], table.shape[1], batch)
         entry = cell_of(batch["observation"]) * table.shape[1] + action
         ahead = table[cell_of(batch["next", "observation"])].amax(-1)
-        steps = batch.get("steps_to_next_obs", None)
-        target = bootstrap_target(
-            batch["next", "reward"].squeeze(-1),
-            ahead,
-            batch["next", "terminated"].squeeze(-1),
-            gamma=self.gamma,
-            steps=None if steps is None else steps.reshape(-1),
-        )
+        target = target_of(batch, ahead, gamma=self.gamma)
         td_error = target - table.view(-1)[entry]
         squared, value = td_error.square(), table.view(-1)[entry]
         log = {"loss_value": squared.mean(), "td_error": squared, "pred_value": value}
@@ -218,7 +262,7 @@ class TabularQLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the table and the count."""
-        return {"loss": {"table": self.table.clone()}, "updates": self.updates}
+        return {"networks": {"table": self.table.clone()}, "updates": self.updates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state from :meth:`state_dict`.
@@ -230,5 +274,5 @@ class TabularQLearner:
             ValueError: If its table is of another size, or not finite; nothing is changed then.
         """
         check_alike("learner", state_dict, self.state_dict())
-        self.table.copy_(state_dict["loss"]["table"])
+        self.table.copy_(state_dict["networks"]["table"])
         self.updates = state_dict["updates"]

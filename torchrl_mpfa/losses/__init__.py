@@ -1,22 +1,14 @@
-"""TorchRL's losses, which write the signals of each transition as they go."""
+"""The mathematics of losses, and the signals of TorchRL's own."""
 
-from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.ddpg import SignalDDPGLoss, make_ddpg_loss
-from torchrl_mpfa.losses.dqn import SignalDQNLoss
+from typing import Any
+
+from torchrl_mpfa.lazy import find
 from torchrl_mpfa.losses.functional import bootstrap_target
-from torchrl_mpfa.losses.sac import SignalSACLoss, make_sac_loss
-from torchrl_mpfa.losses.td3 import SignalTD3Loss, make_td3_loss
 from torchrl_mpfa.losses.torchrl import write_signals
 
-__all__ = [
-    "SignalDDPGLoss",
-    "SignalDQNLoss",
-    "SignalLoss",
-    "SignalSACLoss",
-    "SignalTD3Loss",
-    "bootstrap_target",
-    "make_ddpg_loss",
-    "make_sac_loss",
-    "make_td3_loss",
-    "write_signals",
-]
+__all__ = ["bootstrap_target", "write_signals"]
+
+
+def __getattr__(name: str) -> Any:
+    """Say of a name that went what replaces it."""
+    return find(__name__, name, {})

@@ -6,13 +6,12 @@ the size of an action.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
-from torchrl.objectives.value import TD0Estimator
 
 from torchrl_mpfa.checks import as_mask
 
@@ -35,7 +34,7 @@ def bootstrap_target(
     next_value: Tensor,
     terminated: Tensor,
     *,
-    gamma: float | Tensor,
+    gamma: float,
     steps: Tensor | None = None,
 ) -> Tensor:
     r"""Target :math:`y_i = r_i + \gamma^{n_i} Q'(s_{i+n_i}, \mu'(s_{i+n_i}))`, Eq. (5) for n = 1.
@@ -66,22 +65,16 @@ def bootstrap_target(
     return reward + discount * next_value * ~as_mask("'terminated' of the next step", terminated)
 
 
-def estimated_target(
-    batch: TensorDictBase, next_value: Tensor, estimator: Any, keys: Any, *, reward_scale: float
+def target_of(
+    batch: TensorDictBase, next_value: Tensor, *, gamma: float, reward_scale: float = 1.0
 ) -> Tensor:
-    """Compute targets by a value estimator of TorchRL, Eq. (5) by TD(0), shape ``[B]``."""
-    if type(estimator) is not TD0Estimator or estimator.average_rewards:
-        # A target of other transitions, too.
-        scaled = scale_rewards(batch, keys, reward_scale)
-        longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
-        return longer.squeeze(-1)
-    after, steps = batch["next"], batch.get(estimator.tensor_keys.steps_to_next_obs, None)
-    reward = after[keys.reward] * reward_scale
+    """Compute the targets of a batch (Eq. 5), ``[B]``; of several steps if it has their number."""
+    after, steps = batch["next"], batch.get("steps_to_next_obs", None)
     return bootstrap_target(
-        reward.reshape(next_value.shape),
+        (after["reward"] * reward_scale).reshape(next_value.shape),
         next_value,
-        after[keys.terminated].reshape(next_value.shape),
-        gamma=estimator.gamma,
+        after["terminated"].reshape(next_value.shape),
+        gamma=gamma,
         steps=None if steps is None else steps.reshape(next_value.shape),
     )
 
@@ -192,17 +185,6 @@ def action_gradient(value: Tensor, action: Tensor) -> Tensor:
         value, action, grad_outputs=torch.ones_like(value), retain_graph=True
     )
     return gradient.detach()
-
-
-def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> TensorDictBase:
-    """Return a shallow copy of a batch with scaled rewards, and ends as booleans for TorchRL."""
-    found = batch.copy()
-    after = found["next"]
-    after.set(keys.reward, after[keys.reward] * reward_scale)
-    for key in (keys.done, keys.terminated):
-        if (end := after.get(key, None)) is not None:
-            after.set(key, as_mask(f"{key!r} of the next step", end))
-    return found
 
 
 def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:

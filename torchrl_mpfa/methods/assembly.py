@@ -1,4 +1,4 @@
-"""The replay of a method: buffer, selection, and the signals that the loss has to write."""
+"""The replay of a method: buffer, selection, and the signals that an update has to write."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Replay:
     Attributes:
         buffer: Where transitions are stored and sampled.
         select: Samples the batches of one training step from the buffer.
-        signals: The signals that the loss has to write, by name.
+        signals: The signals that an update has to write, by name.
         method: The settings that it was made from.
         entries: Names of extra entries that transitions must contain: ``"episode"``, a
             number, shape ``[B, 1]``; ``"behavior_mean"``, the action without its noise, ``[B, A]``,
@@ -71,7 +71,7 @@ def make_replay(
     sigma: float | Callable[[], float] | None = None,
     **settings: Any,
 ) -> Replay:
-    """Make the replay of a method: buffer, selection, and the signals that the loss has to write.
+    """Make the replay of a method: buffer, selection, and the signals that an update has to write.
 
     Args:
         method: A name out of :data:`~torchrl_mpfa.methods.METHODS`, or a method of your own.
@@ -126,7 +126,7 @@ def buffer_parts(
 
 
 def loss_options(method: str | Method) -> dict[str, Any]:
-    """Keyword arguments of ``make_ddpg_loss`` and its like that a method needs.
+    """Keyword arguments of :class:`~torchrl_mpfa.ActorCritic` that a method needs.
 
     Args:
         method: A name, or a method of your own.
@@ -152,6 +152,6 @@ def loss_options(method: str | Method) -> dict[str, Any]:
 
 
 def learned_signals(method: Method) -> list[str]:
-    """Return the entries that the loss has to write for the signals of a method."""
+    """Return the entries that an update has to write for the signals of a method."""
     keys = [signal.key for signal in method.priority_signals() if signal.known_at == "update"]
     return sorted({key[-1] if isinstance(key, tuple) else key for key in keys})

@@ -48,15 +48,12 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
     return low, high
 
 
-def given_bounds(action_spec: TensorSpec | None, bounds: Any) -> tuple[Tensor, Tensor]:
-    """Return the least and greatest action of a spec, or of bounds, one of which must be given."""
-    if (action_spec is None) == (bounds is None):
-        raise ValueError(
-            "one of action_spec and bounds must be given, got "
-            f"action_spec={action_spec} and bounds={bounds}"
-        )
-    if action_spec is not None:
-        bounds = action_bounds(action_spec)
+def given_bounds(bounds: Any) -> tuple[Tensor, Tensor]:
+    """Return the least and greatest action of a bounded spec, or of a pair of both."""
+    if isinstance(bounds, TensorSpec):
+        return action_bounds(bounds)
+    if bounds is None:
+        raise ValueError("bounds must be an action spec, or least and greatest action, got None")
     low, high = map(torch.as_tensor, bounds)
     if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
         raise ValueError(f"bounds must be finite, low < high, got {bounds}")

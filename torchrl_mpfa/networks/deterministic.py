@@ -26,8 +26,8 @@ class DirectModule(TensorDictModule):
     """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
 
     A loss that calls a network through tensordicts spends half as much time on them as on the
-    network, if that is small. The losses of this package call these modules directly; any other
-    module works there, too, but slower.
+    network, if that is small. The learners of this package call these modules directly; any other
+    module works in :class:`~torchrl_mpfa.ActorCritic`, too, but slower.
 
     Args:
         module: Function of one tensor per key of ``in_keys``, in their order.
@@ -57,13 +57,9 @@ class DirectModule(TensorDictModule):
         Returns:
             Outputs by key.
         """
-        return self.by_key(self.module(*[inputs.get(key) for key in self.in_keys]))
-
-    def by_key(self, found: Tensor | tuple[Tensor, ...]) -> dict[NestedKey, Tensor]:
-        """Return the module's results by key."""
-        return dict(
-            zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
-        )
+        outputs = self.module(*[inputs.get(key) for key in self.in_keys])
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        return dict(zip(self.out_keys, outputs, strict=True))
 
 
 @dataclass(frozen=True)
@@ -183,7 +179,7 @@ def make_actor(
             None keeps PyTorch's start.
 
     Returns:
-        A module for TorchRL's losses and collectors.
+        A module for :class:`~torchrl_mpfa.ActorCritic`, TorchRL's losses and collectors.
 
     Raises:
         ValueError: If a size is not a positive integer, the spec has other actions, or the limit is
@@ -225,7 +221,7 @@ def make_critic(
         late_action: True to feed the action to the second layer, and not to the first.
 
     Returns:
-        A module for TorchRL's losses.
+        A module for :class:`~torchrl_mpfa.ActorCritic` and TorchRL's losses.
 
     Raises:
         ValueError: If a size is not a positive integer, or a late action has no second layer.

@@ -72,7 +72,7 @@ class StochasticNetwork(nn.Module):
 class StochasticActor(ProbabilisticActor):
     """A :class:`~torchrl.modules.ProbabilisticActor` that is a function of tensors as well.
 
-    :class:`~torchrl_mpfa.SignalSACLoss` calls it directly; any other probabilistic actor works
+    :class:`~torchrl_mpfa.ActorCritic` calls it directly; any other probabilistic actor works
     there, too, but slower.
 
     Args:
@@ -171,7 +171,7 @@ def make_stochastic_actor(
             one; None keeps PyTorch's start.
 
     Returns:
-        A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
+        A module for :class:`~torchrl_mpfa.ActorCritic` and TorchRL's collectors.
 
     Raises:
         ValueError: If a size is not a positive integer, the spec has other actions, or the limit is

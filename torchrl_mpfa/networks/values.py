@@ -71,7 +71,7 @@ def make_value_network(
         final_init: As in :func:`~torchrl_mpfa.make_actor`.
 
     Returns:
-        A module for ``DQNLoss``.
+        A module for :class:`~torchrl_mpfa.DQN` and TorchRL's ``DQNLoss``.
 
     Raises:
         ValueError: If a size is not a positive integer.

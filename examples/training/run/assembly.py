@@ -1,4 +1,4 @@
-"""Networks, loss, optimizers and robots of a training run, put together from its settings."""
+"""Learner and robots of a training run, put together from its settings."""
 
 from __future__ import annotations
 
@@ -14,17 +14,13 @@ from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from mpfa_envs.sensing.binning import Binning
 from torchrl_mpfa import (
-    ActorCriticLearner,
-    DQNLearner,
+    DQN,
+    ActorCritic,
     Learner,
-    SignalDQNLoss,
     TabularQLearner,
     make_actor,
     make_critic,
-    make_ddpg_loss,
-    make_sac_loss,
     make_stochastic_actor,
-    make_td3_loss,
     make_value_network,
 )
 from torchrl_mpfa.methods import Method, Prioritized, loss_options
@@ -48,7 +44,7 @@ def make_learner(
     device: str = "cpu",
     compile: bool = False,
 ) -> Learner:
-    """Networks, loss and optimizers; the loss writes those signals that the method asks for."""
+    """Networks and learner, which writes those signals that the method asks for."""
     if settings.algorithm == "q_learning":
         return _q_learning(settings, method, observation_size, action_size)
     network: Options = {
@@ -64,34 +60,35 @@ def make_learner(
     make = make_stochastic_actor if settings.algorithm == "sac" else make_actor
     limit = settings.saturation_limit
     actor = make(*sizes, **network, saturation_limit=limit if settings.full_range else None)
-    of_loss: Options = {
+    algorithm = settings.algorithm
+    of_algorithm: dict[str, Options] = {
+        "ddpg": {"critics": 1, "policy_delay": settings.policy_delay},
+        "td3": {"critics": 2, "policy_delay": settings.policy_delay},
+        "sac": {"alpha": settings.alpha_init, "alpha_lr": settings.alpha_lr},
+    }
+    if algorithm != "sac":
+        of_algorithm[algorithm] |= {
+            # Wheel speeds are scaled to it by the environment.
+            "bounds": (-1.0, 1.0),
+            "policy_noise": settings.policy_noise,
+            "noise_clip": settings.noise_clip,
+        }
+    return ActorCritic(
+        actor.to(device),
+        critic.to(device),
+        **of_algorithm[algorithm],
         **_options(method),
-        "gamma": settings.gamma,
-        "reward_scale": settings.reward_scale,
-        "saturation_penalty": settings.saturation_penalty,
-        "saturation_limit": settings.saturation_limit,
-    }
-    of_learner: Options = {
-        "actor_lr": settings.actor_lr,
-        "critic_lr": settings.critic_lr,
-        "critic_weight_decay": settings.critic_weight_decay,
-        "tau": settings.tau,
-        "optimizer": method.optimizer,
-        "compile": compile,
-    }
-    actor, critic = actor.to(device), critic.to(device)
-    if settings.algorithm == "sac":
-        loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
-        return ActorCriticLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
-    smoothing: Options = {
-        # Wheel speeds are scaled to it by the environment.
-        "bounds": (-1.0, 1.0),
-        "policy_noise": settings.policy_noise,
-        "noise_clip": settings.noise_clip,
-    }
-    make_loss = make_td3_loss if settings.algorithm == "td3" else make_ddpg_loss
-    loss = make_loss(actor, critic, **smoothing, **of_loss)
-    return ActorCriticLearner(loss, policy_delay=settings.policy_delay, **of_learner)
+        gamma=settings.gamma,
+        reward_scale=settings.reward_scale,
+        saturation_penalty=settings.saturation_penalty,
+        saturation_limit=settings.saturation_limit,
+        actor_lr=settings.actor_lr,
+        critic_lr=settings.critic_lr,
+        critic_weight_decay=settings.critic_weight_decay,
+        tau=settings.tau,
+        optimizer=method.optimizer,  # type: ignore[arg-type]
+        compile=compile,
+    )
 
 
 def _options(method: Method) -> Options:
@@ -102,15 +99,12 @@ def _options(method: Method) -> Options:
 
 def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
     options = _options(method)
-    loss = SignalDQNLoss(
+    return DQN(
         network,
         **{name: options[name] for name in ("signals", "importance", "loss_function")},
         double=settings.double,
         gamma=settings.gamma,
         reward_scale=settings.reward_scale,
-    )
-    return DQNLearner(
-        loss,
         lr=settings.critic_lr,
         weight_decay=settings.critic_weight_decay,
         tau=settings.tau,

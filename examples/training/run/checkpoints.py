@@ -21,8 +21,8 @@ from training.run.hooks import Hook
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
 
-FORMAT = 6
-"""5: many robots, in the middle of their episodes."""
+FORMAT = 7
+"""7: networks and targets of a learner; 5: many robots, in the middle of their episodes."""
 
 
 class Checkpoints(Hook):
@@ -53,7 +53,7 @@ def save(run: TrainingRun) -> None:
 
 def is_sound(learner: Learner) -> bool:
     """Return True if all parameters are finite."""
-    return all(bool(value.isfinite().all()) for value in learner.state_dict()["loss"].values())
+    return all(bool(value.isfinite().all()) for value in learner.state_dict()["networks"].values())
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any]:

@@ -250,17 +250,21 @@ class TrainingRun:
             self._events.append(("on_update", {**losses, **self._bonus}, batch))
 
     def _prepared(self, sampled: SampledBatch) -> SampledBatch:
-        """Move a sampled batch to the networks, and add signals and bonuses of the run."""
+        """Move sampled batches to the networks, and add signals and bonuses of the run."""
         device = self.settings.device
         if sampled.gives_signals:
-            self.log.learns(sampled.batch["index"])
+            for index in sampled.batch["index"].chunk(sampled.batches):
+                self.log.learns(index)
         if device != "cpu":
             sampled = replace(sampled, batch=sampled.batch.to(device))
-        if self.curiosity is not None and sampled.gives_signals:
-            self._bonus = self.curiosity(sampled.batch)
-        if sampled.gives_signals:
-            self.signals.write(self.learner, sampled.batch)
-        return sampled
+        if not sampled.gives_signals or (self.curiosity is None and not self.signals):
+            return sampled
+        parts = [part.batch for part in sampled.parts()]
+        for batch in parts:
+            if self.curiosity is not None:
+                self._bonus = self.curiosity(batch)
+            self.signals.write(self.learner, batch)
+        return replace(sampled, batch=torch.cat(parts))
 
     def _evaluate(self) -> None:
         found, self.driven = evaluate_policy(

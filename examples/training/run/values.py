@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 
 from mpfa_envs import Policy
-from torchrl_mpfa import Learner
-from torchrl_mpfa.losses import SignalLoss
+from torchrl_mpfa import ActorCritic, Learner
 from training.pictures import Values
 from training.run.assembly import make_learner, method_of
 from training.run.checkpoints import read_checkpoint
@@ -53,20 +52,16 @@ def values_of(learner: Learner, policy: Policy, settings: TrainSettings) -> Valu
         The values, in units of the reward.
     """
     device = settings.device
-    scale, loss = settings.learner.reward_scale, getattr(learner, "loss", None)
+    scale = settings.learner.reward_scale
 
     def worth(observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        seen: dict[Any, torch.Tensor] = {}
-        seen["observation"] = torch.as_tensor(observations, device=device)
+        seen = {"observation": torch.as_tensor(observations, device=device)}
         with torch.no_grad():
-            if isinstance(loss, SignalLoss):
+            if isinstance(learner, ActorCritic):
                 seen["action"] = torch.as_tensor(policy(observations), device=device)
-                found = [
-                    critic.outputs(seen)["state_action_value"] for critic in loss.current_critics()
-                ]
-                best = torch.stack(found).amin(0)
+                best = learner.values_of(TensorDict(seen, [len(observations)])).amin(0)
             else:
-                best = learner.policy.outputs(seen)["chosen_action_value"]
-        return best.squeeze(-1).double().cpu().numpy() / scale
+                best = learner.policy.outputs(seen)["chosen_action_value"].squeeze(-1)
+        return best.double().cpu().numpy() / scale
 
     return worth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -91,9 +92,9 @@ def test_a_replay_of_ones_own_is_used_as_it_is(walk: FrozenBuffer) -> None:
 def test_the_values_of_critics_are_in_units_of_the_reward(walk: FrozenBuffer) -> None:
     learner = make_frozen_learner(walk, METHODS["uniform"], 0)
     inner = learner._learner
-    inner.loss.reward_scale = 1.0
+    inner.reward_scale = 1.0
     plain = critic_values(inner, walk.rows[:5])
-    inner.loss.reward_scale = 0.1
+    inner.reward_scale = 0.1
     assert critic_values(inner, walk.rows[:5]).allclose(10.0 * plain)
     assert plain.shape == (2, 5)
 
@@ -156,11 +157,11 @@ def test_the_buffers_of_the_project_are_of_runs_with_and_without_dense_rewards()
 def test_the_error_of_both_images_is_the_mean_of_two_that_are_alone() -> None:
     buffer = frozen_buffers(FOLDER)[0]
     learner = make_frozen_learner(buffer, METHODS["per"], 0)._learner
-    learner.loss.policy_noise = 0.0
+    learner.policy_noise = 0.0
     rows = buffer.rows[:32]
     alone = []
     for batch in (rows.clone(), mirror(chance=1.0)(rows.clone())):
-        learner.loss.losses(batch, trains="critic")
+        copy.deepcopy(learner).update(SampledBatch(batch, trains="critic"))
         alone.append(batch["signals", "td_error"])
     assert both_images(learner, rows).allclose(torch.stack(alone).mean(0), rtol=1e-4)
     assert not alone[0].allclose(alone[1])

@@ -13,7 +13,7 @@ from torch._inductor.exc import InductorError
 from torch.utils import cpp_extension
 
 from tests.integration.tiny_runs import OVERRIDES, tiny, train
-from torchrl_mpfa.learners.base import Learner
+from torchrl_mpfa import Learner
 from training.files import CHECKPOINT
 from training.run import loop
 from training.run.assembly import make_learner

@@ -112,7 +112,7 @@ def test_every_method_trains_every_learner_by_its_own_signals(
     run = train(tmp_path, settings)
     assert run.updates > 0
     assert all(math.isfinite(record.reward) for record in run.records)
-    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
+    weights = [value for value in run.learner.networks.state_dict().values() if value.ndim > 0]
     assert all(value.isfinite().all() for value in weights)
     signals = [signal.name for signal in settings.method.priority_signals()]
     if not signals:
@@ -259,7 +259,7 @@ def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str
 
 def test_a_checkpoint_of_another_version_or_a_damaged_one_is_rejected(tmp_path: Path) -> None:
     save_atomically({"format": 3}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 3, this version reads 6"):
+    with pytest.raises(ValueError, match=r"format 3, this version reads 7"):
         read_checkpoint(tmp_path)
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     with pytest.raises(ValueError, match=CHECKPOINT):
@@ -293,7 +293,7 @@ def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
 
     def fail(run: TrainingRun) -> None:
         if run.actions == 35:
-            for weight in run.learner.loss.parameters():
+            for weight in run.learner.networks.parameters():
                 weight.data.fill_(math.nan)
             raise RuntimeError("something broke")
 

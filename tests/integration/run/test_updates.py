@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
+from tensordict import TensorDictBase
 
 from tests.integration.tiny_runs import go_on, mostly_slow, stop_after, tiny, train
 from torchrl_mpfa.selection import SampledBatch
@@ -144,3 +145,16 @@ def test_a_transition_in_the_place_of_an_old_one_was_never_learned_from() -> Non
     log.learns(torch.tensor([0, 1]))
     _, before, _ = log.state_dict()["last"]
     assert before.tolist() == [1, -1]
+
+
+def test_updates_of_a_round_are_offered_to_the_program_at_once(tmp_path: Path) -> None:
+    run, offered = TrainingRun(tiny(updates=3), tmp_path), []
+
+    def update_each(rows: TensorDictBase, batches: int) -> None:
+        offered.append((len(rows), batches))
+
+    run.learner.update_each = update_each  # type: ignore[attr-defined]
+    run.train()
+    run.close()
+    assert offered == [(3 * 8, 3)] * (run.updates // 3)
+    assert run.updates > 30

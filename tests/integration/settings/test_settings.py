@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from tests.mpfa.losses import make_batch
+from tests.mpfa.learning import make_batch
 from torchrl_mpfa.checks import rules_of
 from training.run.assembly import make_learner
 from training.settings.checks import OF_A_METHOD, check_settings

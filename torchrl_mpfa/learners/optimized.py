@@ -1,0 +1,303 @@
+"""Networks, target networks and one optimizer behind one ``update``.
+
+A learner knows nothing of replay or environment: a batch goes in, signals come back in it. Another
+learner has the same methods and takes its place.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from torchrl_mpfa.checks import ABOVE_ZERO, SHARE, Rule, check
+from torchrl_mpfa.learners.adam import FlatAdam
+from torchrl_mpfa.learners.checks import check_alike, check_losses, fits_loss
+from torchrl_mpfa.learners.compiled import CompiledUpdate, Step
+from torchrl_mpfa.selection import SampledBatch, Trains
+
+OptimizerName = Literal["adam", "radam"]
+IMPORTANCE: Rule = (
+    lambda use: use in ("critic", "torchrl", "none"),
+    "'critic', 'torchrl' or 'none'",
+)
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """Methods of a learner that a training loop calls."""
+
+    policy: TensorDictModule
+
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """Train on a batch, write its signals, and return values for the log.
+
+        Args:
+            sampled: The batch and the networks that learn from it; a batch of size ``[B]`` stands
+                for ``SampledBatch(batch)``.
+
+        Returns:
+            Detached values for the log, of the losses that were computed.
+        """
+        ...
+
+    def end_episode(self) -> None:
+        """Signal the end of an episode."""
+        ...
+
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of their first values."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state from :meth:`state_dict`."""
+        ...
+
+
+class OptimizedLearner:
+    r"""Networks, targets that follow them, and one optimizer whose rates can be lowered.
+
+    Targets follow by :math:`\theta' \leftarrow \tau\theta + (1 - \tau)\theta'` (Eqs. 6-7). A copy
+    shares nothing with the learner.
+
+    Args:
+        networks: Networks by name.
+        targets: Copies of networks by the same names.
+        groups: Groups of parameters for the optimizer.
+        optimizer: ``"adam"`` or ``"radam"``.
+        tau: :math:`\tau`.
+    """
+
+    policy_delay = 1
+    """Updates of the critics for one of the actor and of the target networks."""
+
+    def __init__(
+        self,
+        networks: nn.ModuleDict,
+        targets: nn.ModuleDict,
+        groups: list[dict[str, Any]],
+        optimizer: OptimizerName,
+        tau: float,
+    ) -> None:
+        self.tau = check(ABOVE_ZERO, tau=tau)
+        self.networks: Any = networks
+        self.targets: Any = targets
+        self.optimizer = make_optimizer(optimizer, groups)
+        self._rates = [group["lr"] for group in groups]
+        self._program: CompiledUpdate | None = None
+        self.updates = 0
+        """Training steps taken."""
+        self._flatten()
+
+    def _flatten(self) -> None:
+        """Make the parameters of a group views of one tensor, and their targets of another."""
+        online = [p for name in self.targets for p in self.networks[name].parameters()]
+        pairs: list[Any] = list(zip(online, self.targets.parameters(), strict=True))
+        flat = []
+        if isinstance(self.optimizer, FlatAdam):
+            self.optimizer.flatten({id(own): target for own, target in pairs})
+            flat = [group for group in self.optimizer.flat_groups if group.followed]
+        done = {id(own) for group in flat for own in group.followed}
+        pairs = [pair for pair in pairs if id(pair[0]) not in done]
+        pairs += [(group.values[: len(group.targets)], group.targets) for group in flat]
+        self._online, self._followers = map(list, zip(*pairs, strict=True))
+        if self._program is not None:
+            self._program.forget()
+
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """Step the networks and the target networks, as far as they are due.
+
+        Args:
+            sampled: The batch and the networks that learn from it; a batch of size ``[B]`` stands
+                for ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the
+                target networks move with the actor. A false ``new_step`` marks a further batch of
+                the same training step, which a delay of the actor does not count.
+
+        Returns:
+            Detached values for the log; none for a batch of the actor alone that is not due.
+
+        Raises:
+            KeyError: If the batch lacks an entry.
+            RuntimeError: If the batch does not fit the networks.
+            ValueError: If a loss is not finite. Nothing of the learner is changed then.
+        """
+        if not isinstance(sampled, SampledBatch):
+            sampled = SampledBatch(sampled)
+        updates = self.updates + sampled.new_step
+        trains, due = sampled.trains, self._is_due(updates)
+        if trains == "both" and not due:
+            trains = "critic"
+        log: dict[str, Tensor] = {}
+        if trains == "critic" or due:
+            log = self._step(sampled.batch, trains, sampled.loss_function)
+        self.updates = updates
+        return log
+
+    def update_each(self, rows: TensorDictBase, batches: int) -> dict[str, Tensor] | None:
+        """Make an update with each batch of rows by the compiled program, and write their signals.
+
+        Args:
+            rows: Batches of one size, one after the other, ``[U * B]``.
+            batches: ``U``.
+
+        Returns:
+            The log of the last update; None, before anything is done, without a program or with an
+            ``update`` of one's own.
+
+        Raises:
+            KeyError: As :meth:`update`.
+            RuntimeError: As :meth:`update`.
+            ValueError: As :meth:`update`, of whose kind the earlier ones were made.
+        """
+        own = getattr(self.update, "__func__", None) is not OptimizedLearner.update
+        if self._program is None or own:
+            return None
+        self._look()
+        counts = range(self.updates + 1, self.updates + 1 + batches)
+        turns: list[Trains] = ["both" if self._is_due(number) else "critic" for number in counts]
+        size = len(rows) // batches
+        with fits_loss(rows):
+            steps = self._program.each(rows, size, turns)
+        if steps is None:
+            return None
+        for number, (step, trains) in enumerate(zip(steps, turns, strict=True)):
+            if not step.taken:
+                self._take_step(step.log, rows[number * size : (number + 1) * size], trains)
+            self.updates += 1
+        return step.log
+
+    def _is_due(self, update: int) -> bool:
+        """Return True if an update of this number is one of the actor and the targets as well."""
+        return update % self.policy_delay == 0
+
+    def _step(
+        self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
+    ) -> dict[str, Tensor]:
+        """Step the optimizer, and the target networks with the actor; return the log."""
+        self._look()
+        with fits_loss(batch):
+            step = None if self._program is None else self._program(batch, trains, loss_function)
+            if step is None:
+                self.clear_gradients()
+                step = Step(self._differentiate(batch, trains, loss_function), False)
+        if not step.taken:
+            self._take_step(step.log, batch, trains)
+        return step.log
+
+    def _differentiate(
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
+    ) -> dict[str, Tensor]:
+        """Set the gradients, write the signals, and return detached values for the log."""
+        raise NotImplementedError
+
+    def _take_step(self, log: dict[str, Tensor], batch: TensorDictBase, trains: Trains) -> None:
+        """Step by the gradients, if the losses are finite."""
+        check_losses(log, batch)
+        self.optimizer.step()
+        if trains != "critic":
+            self.move_targets()
+
+    def _look(self) -> None:
+        """Follow parameters that lie elsewhere now."""
+        if isinstance(self.optimizer, FlatAdam) and not self.optimizer.holds():
+            self._flatten()
+
+    @property
+    def _share(self) -> float:
+        # As TorchRL computes it, to the last bit.
+        return 1.0 - (1.0 - self.tau)
+
+    @torch.no_grad()
+    def move_targets(self) -> None:
+        """Move the targets by tau towards the networks that they follow (Eqs. 6-7)."""
+        torch._foreach_lerp_(self._followers, self._online, self._share)
+
+    def record_targets(self, finite: Tensor) -> None:
+        """Move the targets by operations that can be recorded, if the losses are finite."""
+        for target, online in zip(self._followers, self._online, strict=True):
+            moved = torch.lerp(target, online, self._share)
+            target.copy_(torch.where(finite, moved, target))
+
+    def clear_gradients(self) -> None:
+        """Let no parameter have a gradient."""
+        for group in self.optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    def end_episode(self) -> None:
+        """Change nothing."""
+
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of the constructor's.
+
+        Args:
+            factor: The fraction, in [0, 1].
+
+        Raises:
+            ValueError: If ``factor`` is outside.
+        """
+        factor = check(SHARE, factor=factor)
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * factor
+
+    def __copy__(self) -> Any:
+        return copy.deepcopy(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Parameters of a copy or of a pickle are views of nothing yet.
+        vars(self).update(state)
+        self._flatten()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, targets, optimizer and count, as tensors and plain values."""
+        return {
+            "networks": self.networks.state_dict(),
+            "targets": self.targets.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state from :meth:`state_dict`.
+
+        Args:
+            state_dict: The state of a learner of the same kind, with networks of the same sizes.
+
+        Raises:
+            ValueError: If it is of another kind or size, or not finite; nothing is changed then.
+        """
+        if isinstance(state_dict, Mapping) and "loss" in state_dict:
+            raise ValueError(
+                "the saved learner is of version 0.4, which is not read: finish its run with 0.4"
+            )
+        # A twin takes a step, so that it has all moments: PyTorch does not check their sizes, and
+        # its fused optimizers write past the end.
+        twin = copy.deepcopy(self.optimizer)
+        for group in twin.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter)
+        twin.step()
+        check_alike("learner", state_dict, {**self.state_dict(), "optimizer": twin.state_dict()})
+        self.networks.load_state_dict(state_dict["networks"])
+        self.targets.load_state_dict(state_dict["targets"])
+        # PyTorch would share the tensors with the owner of the state.
+        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
+        self.updates = state_dict["updates"]
+
+
+def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+    """Make the optimizer of this name, which steps all tensors in one call."""
+    if name == "adam":
+        return FlatAdam(groups)
+    if name == "radam":
+        return torch.optim.RAdam(groups, foreach=True)
+    raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
