@@ -41,10 +41,10 @@ from mpfa_envs.render.charts import finish, new_figure
 from torchrl_mpfa import (
     Learner,
     MPFASampler,
-    ReplayHistory,
     SignalReplayBuffer,
     SignalTensorStorage,
 )
+from torchrl_mpfa.history import ReplayHistory
 from training.evaluating import Drivable, drive, filtered
 from training.pictures import Values, longest, trajectories_of
 from training.records import read_table

@@ -30,8 +30,8 @@ def test_the_first_code_trains_and_prints_three_different_shares(
     names["env"].close()
 
 
-def test_the_first_code_has_fifteen_lines_at_most() -> None:
-    assert len(BLOCKS[0].strip().splitlines()) <= 15
+def test_the_first_code_has_ten_lines_at_most() -> None:
+    assert len(BLOCKS[0].strip().splitlines()) <= 10
 
 
 def test_its_make_targets_exist() -> None:

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from torchrl_mpfa.fusion import FixedFusion as FixedFusion
     from torchrl_mpfa.fusion import Fusion as Fusion
     from torchrl_mpfa.fusion import ScaledFusion as ScaledFusion
-    from torchrl_mpfa.history import ReplayHistory as ReplayHistory
     from torchrl_mpfa.learners import DQN as DQN
     from torchrl_mpfa.learners import ActorCritic as ActorCritic
     from torchrl_mpfa.learners import Learner as Learner
-    from torchrl_mpfa.learners import TabularQLearner as TabularQLearner
     from torchrl_mpfa.losses import write_signals as write_signals
+    from torchrl_mpfa.methods import METHODS as METHODS
+    from torchrl_mpfa.methods import make_replay as make_replay
     from torchrl_mpfa.networks import make_actor as make_actor
     from torchrl_mpfa.networks import make_critic as make_critic
     from torchrl_mpfa.networks import make_stochastic_actor as make_stochastic_actor
@@ -42,9 +42,9 @@ _NAMES = {
     "adjustment": "Adjustment PositiveBoost PositiveDecay",
     "buffer": "SignalReplayBuffer",
     "fusion": "EntropyFusion FixedFusion Fusion ScaledFusion",
-    "history": "ReplayHistory",
-    "learners": "DQN ActorCritic Learner TabularQLearner",
+    "learners": "DQN ActorCritic Learner",
     "losses": "write_signals",
+    "methods": "METHODS make_replay",
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "samplers": "MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",

@@ -25,6 +25,8 @@ GONE = {
     "SignalDQNLoss": _DQN,
     "DQNLearner": _DQN,
     "MultiTensorSoftUpdate": "TorchRL's SoftUpdate: a learner moves its targets itself",
+    "ReplayHistory": "torchrl_mpfa.history.ReplayHistory",
+    "TabularQLearner": "torchrl_mpfa.learners.TabularQLearner",
     "hydra": "nothing: a Hydra file names each part as _target_",
     "SignalStorageMixin": "nothing: the sampler keeps the signals",
     "SignalTable": "torchrl_mpfa.samplers.SignalTable",

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from tests.methods.replays import make_transitions
 from tests.mpfa.transitions import same
-from torchrl_mpfa import ReplayHistory
+from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.integrations.ray import (
     MethodReplayBuffer,
     RaySignalReplayBuffer,

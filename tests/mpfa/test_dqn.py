@@ -11,10 +11,10 @@ from tensordict import TensorDict
 from torchrl_mpfa import (
     DQN,
     Learner,
-    TabularQLearner,
     make_value_network,
     run_updates,
 )
+from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.networks import make_value_table
 from torchrl_mpfa.selection import SampledBatch

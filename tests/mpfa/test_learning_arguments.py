@@ -13,12 +13,12 @@ from tests.mpfa.learning import BOUNDS, KINDS, make_discrete, make_learner, make
 from torchrl_mpfa import (
     DQN,
     ActorCritic,
-    TabularQLearner,
     make_actor,
     make_critic,
     make_stochastic_actor,
     make_value_network,
 )
+from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.learners.optimized import make_optimizer
 from torchrl_mpfa.losses.functional import distance
 from torchrl_mpfa.methods.curiosity import Curiosity

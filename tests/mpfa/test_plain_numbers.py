@@ -16,10 +16,10 @@ from torchrl_mpfa import (
     PositiveDecay,
     SignalReplayBuffer,
     SignalTensorStorage,
-    TabularQLearner,
 )
 from torchrl_mpfa.checks import COUNT, SHARE, check
 from torchrl_mpfa.history import ReplayHistory
+from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.hvper import HVPERPenalty, ScheduledFusion

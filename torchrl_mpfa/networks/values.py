@@ -95,7 +95,7 @@ def make_value_table(cell_of: Callable[[Tensor], Tensor], cells: int, actions: i
         actions: Number of actions ``K``.
 
     Returns:
-        A module for :class:`~torchrl_mpfa.TabularQLearner`.
+        A module for :class:`~torchrl_mpfa.learners.TabularQLearner`.
 
     Raises:
         ValueError: If a size is not a positive integer.

@@ -17,12 +17,12 @@ from torchrl_mpfa import (
     DQN,
     ActorCritic,
     Learner,
-    TabularQLearner,
     make_actor,
     make_critic,
     make_stochastic_actor,
     make_value_network,
 )
+from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchrl_mpfa import ReplayHistory, SignalReplayBuffer
+from torchrl_mpfa import SignalReplayBuffer
+from torchrl_mpfa.history import ReplayHistory
 
 if TYPE_CHECKING:
     import pandas as pd
