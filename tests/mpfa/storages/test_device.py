@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from tests.mpfa.samplers.test_trees import MADE
 from tests.mpfa.second_device import DEVICE
-from tests.mpfa.test_leaves import MADE
 from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same, seeded
 from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
