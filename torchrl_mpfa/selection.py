@@ -64,6 +64,17 @@ class SampledBatch:
         return [replace(self, batch=part, batches=1) for part in rows]
 
 
+def as_sampled(sampled: SampledBatch | TensorDictBase) -> SampledBatch:
+    """Return what an update learns from, given as such or as a batch; reject several batches."""
+    if not isinstance(sampled, SampledBatch):
+        return SampledBatch(sampled)
+    if sampled.batches > 1:
+        raise ValueError(
+            f"sampled must be one batch, got {sampled.batches}: update by each of sampled.parts()"
+        )
+    return sampled
+
+
 @runtime_checkable
 class Selection(Protocol):
     """A choice of the batches of a training step; any callable of this form will do.

@@ -18,7 +18,7 @@ from torchrl_mpfa.losses.functional import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
 from torchrl_mpfa.priorities import td_error_priority
-from torchrl_mpfa.selection import SampledBatch, Trains
+from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
 _DISTANCES = ("l1", "l2", "smooth_l1")
@@ -26,8 +26,7 @@ _DISTANCES = ("l1", "l2", "smooth_l1")
 
 def _whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
     """Return the sampled batch, which must be for actor and critic alike."""
-    if not isinstance(sampled, SampledBatch):
-        return sampled
+    sampled = as_sampled(sampled)
     if sampled.trains != "both" or sampled.loss_function is not None:
         raise ValueError(
             f"a batch for the {sampled.trains} alone, or with the loss function "

@@ -19,7 +19,7 @@ from torchrl_mpfa.checks import ABOVE_ZERO, SHARE, Rule, check
 from torchrl_mpfa.learners.adam import FlatAdam
 from torchrl_mpfa.learners.checks import check_alike, check_losses, fits_loss
 from torchrl_mpfa.learners.compiled import CompiledUpdate, Step
-from torchrl_mpfa.selection import SampledBatch, Trains
+from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
 
 OptimizerName = Literal["adam", "radam"]
 IMPORTANCE: Rule = (
@@ -128,10 +128,10 @@ class OptimizedLearner:
         Raises:
             KeyError: If the batch lacks an entry.
             RuntimeError: If the batch does not fit the networks.
-            ValueError: If a loss is not finite. Nothing of the learner is changed then.
+            ValueError: If a loss is not finite, or ``sampled`` has several batches. Nothing of the
+                learner is changed then.
         """
-        if not isinstance(sampled, SampledBatch):
-            sampled = SampledBatch(sampled)
+        sampled = as_sampled(sampled)
         updates = self.updates + sampled.new_step
         trains, due = sampled.trains, self._is_due(updates)
         if trains == "both" and not due:

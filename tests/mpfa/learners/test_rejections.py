@@ -3,6 +3,7 @@
 import math
 import re
 from copy import deepcopy
+from functools import partial
 
 import pytest
 import torch
@@ -191,3 +192,10 @@ def test_state_of_another_kind_or_size_changes_nothing():
     for other in (make_learner("td3"), make_learner("sac"), wide):
         with rejected(learner, ValueError, "the saved learner, 'networks'"):
             learner.load_state_dict(other.state_dict())
+
+
+@pytest.mark.parametrize("make", [*(partial(make_learner, kind) for kind in KINDS), make_discrete])
+def test_several_batches_are_not_taken_for_one(make):
+    learner, several = make(), SampledBatch(make_batch(), batches=2)
+    with rejected(learner, ValueError, "sampled must be one batch, got 2: update by each of sampl"):
+        learner.update(several)
