@@ -138,8 +138,6 @@ def test_a_worker_that_is_killed_is_lost_once_and_replaced(
     assert log.read_text() == "whole\n"
 
 
-@pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
-@pytest.mark.slow
 def test_a_script_whose_output_has_no_room_says_so_and_its_worker_stays(
     worker: LocalWorker,
 ) -> None:
@@ -151,6 +149,8 @@ def test_a_script_whose_output_has_no_room_says_so_and_its_worker_stays(
     assert end_of(worker) == 0
 
 
+@pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
+@pytest.mark.slow
 def test_a_comparison_whose_worker_is_killed_gives_the_rows_of_one_that_is_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
