@@ -10,7 +10,6 @@ a seed and a kind of worlds.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -155,4 +154,4 @@ def _lowest(values: pd.Series) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

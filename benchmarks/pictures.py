@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +45,7 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.history import ReplayHistory
 from training.evaluating import Drivable, drive, filtered
+from training.files import run_script
 from training.pictures import Values, longest, trajectories_of
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -267,4 +267,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

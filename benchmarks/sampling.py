@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -35,7 +34,7 @@ from torchrl_mpfa.checks import unknown
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 from torchrl_mpfa.methods.catalogue import MW
 from torchrl_mpfa.methods.ref_er import ReFERSampler
-from training.files import check_folder
+from training.files import check_folder, run_script
 
 COUNT = 2_000
 BATCH_SIZE = 128
@@ -230,4 +229,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -124,8 +124,7 @@ class Child:
                 for module, name in (figures, "plot_learning_curve"), (charts, "plot_histograms"):
                     setattr(module, name, lambda *arguments: None)
             watch(self.seen, pipe)
-            script.train(words)
-            status = 0
+            files.run_script(lambda: script.train(words))
         except SystemExit as error:
             status = error.code
         except BaseException as error:
@@ -200,7 +199,9 @@ def content(folder: Path) -> dict[str, bytes]:
         table = read_table(folder / name).drop(columns=["seconds", "trained_for"], errors="ignore")
         found[name] = table.to_csv().encode()
     logs = [file for file in (folder / files.CSV).rglob("*.csv") if file.parent.name != "time"]
-    return found | {str(file.relative_to(folder)): file.read_bytes() for file in logs}
+    found |= {str(file.relative_to(folder)): file.read_bytes() for file in logs}
+    # What is left of the run before is no part of a run.
+    return found | {file.name: b"" for file in folder.glob(files.PREVIOUS)}
 
 
 def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str, bytes]) -> Any:
@@ -236,7 +237,8 @@ def make(kind: str, trial: int, durations: list[list[float]], expected: dict[str
             row["damaged"], row["scratch"] = damaged(folder), len(os.listdir(place / "scratch"))
             row["resumed"] = Child(folder, *shown, resume=saved).wait()
             after = content(folder) if row["resumed"] == 0 else {}
-            row["differs"] = " ".join(n for n in expected if after.get(n) != expected[n])
+            names = sorted(expected.keys() | after.keys())
+            row["differs"] = " ".join(n for n in names if after.get(n) != expected.get(n))
             wanted = (files.CURVE, files.HISTOGRAMS) if "charts" in shown else ()
             row["missing"] = " ".join(name for name in wanted if not (folder / name).exists())
             return row | {"damaged_after": damaged(folder)}

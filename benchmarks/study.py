@@ -10,7 +10,6 @@ the right the measure of each run, its mean and Student's 95 % interval.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs.render.charts import Curve, finish, looks, new_figure, seed_band
+from training.files import run_script
 from training.records import area_under, read_table
 from training.statistics import mean_interval
 
@@ -176,4 +176,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -12,7 +12,6 @@ rows to ``--rows``, by default ``FOLDER/rows``; the page is made of those in doc
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -114,4 +113,4 @@ def _time(folder: Path, rows: Path, _: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    files.run_script(main)

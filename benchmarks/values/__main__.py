@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from benchmarks.values.frozen import FOLDER, frozen_buffers
 from benchmarks.values.report import missing, write_report
 from benchmarks.values.running import make_rows, read_rows
 from torchrl_mpfa.checks import unknown
+from training.files import run_script
 
 ROWS = "rows.csv"
 
@@ -74,4 +74,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,9 +35,10 @@ _LONGEST_PATH = 3584
 """Bytes of a path. Linux takes 4096, and a run writes in its folder."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a disk that has no room for a file."""
-_TABLES = (EPISODES, EVALUATIONS, UPDATES)
+AGAIN = "then give the same command again"
 # The checkpoint first: once it is gone, nothing can resume the old run.
-_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS, CSV, TENSORBOARD)
+_SAVED = (CHECKPOINT, POLICY, EPISODES, EVALUATIONS, UPDATES, CURVE, HISTOGRAMS)
+_OF_A_RUN = (*_SAVED, SETTINGS, STATUS, CSV, TENSORBOARD)
 
 
 class FolderInUse(RuntimeError):
@@ -97,25 +99,68 @@ def check_folder(folder: Path) -> None:
         raise ValueError(f"{folder} cannot be written, as {there} is not yours: name another one")
 
 
+def no_room(error: BaseException | None) -> OSError | None:
+    """Return the error of a disk that has no room, of an error and its causes; None without one."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in FULL:
+            return error
+        error = error.__cause__
+    return None
+
+
 def full_disk(error: BaseException) -> str | None:
     """Return in one sentence that a disk has no room for a file; None for other errors."""
-    if not (isinstance(error, OSError) and error.errno in FULL):
+    full = no_room(error)
+    if full is None:
         return None
-    file = error.filename or "a file"
-    return f"{file} cannot be written, {os.strerror(error.errno or 0)}: free some of its disk"
+    file = full.filename or "a file"
+    return f"{file} cannot be written, {os.strerror(full.errno or 0)}: free some of its disk"
 
 
 def run_script(main: Callable[[], object]) -> NoReturn:
     """Run a script; exit with its status, and with 1 after one line if a disk is full."""
+    threading.excepthook = _report_thread
     try:
-        status = main()
-    except OSError as error:
+        try:
+            status = main()
+        finally:
+            _flush()
+    except Exception as error:
         if (cause := full_disk(error)) is None:
             raise
-        name = Path(sys.argv[0]).name
-        print(f"{name}: {cause}, then give the same command again", file=sys.stderr)
-        status = 1
+        with suppress(OSError):  # Where errors go may be on the disk that is full.
+            print(f"{Path(sys.argv[0]).name}: {cause}, {AGAIN}", file=sys.stderr)
+        raise SystemExit(1) from error
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _report_thread(ended: threading.ExceptHookArgs) -> None:
+    """Report what ended a thread, but for a full disk that the thread keeps for its owner."""
+    if no_room(getattr(ended.thread, "exception", None)) is None:
+        threading.__excepthook__(ended)
+
+
+def _flush() -> None:
+    """Write what was printed; on a full disk raise ``OSError``, and let the end not try again."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        if no_room(error) is None:
+            return
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        error.filename = "the output"
+        raise
+
+
+@contextmanager
+def naming(folder: Path | str) -> Iterator[None]:
+    """Name a folder in the error of a full disk that names no file, as those of logs do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL and error.filename is None:
+            error.filename = str(folder)
+        raise
 
 
 @contextmanager
@@ -135,8 +180,11 @@ def lock(folder: Path) -> Iterator[None]:
     try:
         # Not in the folders of a comparison's runs, each of which has a lock of its own.
         for half_written in (*folder.glob(".*.tmp"), *(folder / CSV).rglob(".*.tmp")):
+            if half_written.is_dir():
+                shutil.rmtree(half_written)
             half_written.unlink(missing_ok=True)
-        yield
+        with naming(folder):
+            yield
     finally:
         held.release()
 
@@ -148,8 +196,18 @@ def wait_until_free(folder: Path, seconds: float) -> None:
 
 
 def set_aside(folder: Path) -> None:
-    """Move the files of an earlier run to ``previous/``, in place of those that lie there."""
-    if not any((folder / name).exists() for name in _OF_A_RUN):
+    """Move the files of an earlier run to ``previous/``, in place of those that lie there.
+
+    A run that ended before it saved anything has logs alone, which are removed.
+    """
+    there = [name for name in _OF_A_RUN if (folder / name).exists()]
+    # A run set aside what it found before it wrote its settings: the logs are its own.
+    if SETTINGS in there and not {*_SAVED} & {*there} and _is_of_a_run(folder / SETTINGS):
+        for name in (CSV, TENSORBOARD):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        (folder / STATUS).unlink(missing_ok=True)
+        return
+    if not there:
         return
     previous = folder / PREVIOUS
     previous.mkdir(exist_ok=True)
@@ -157,6 +215,10 @@ def set_aside(folder: Path) -> None:
         if (previous / name).is_dir():
             shutil.rmtree(previous / name)
         (previous / name).unlink(missing_ok=True)
-    for name in _OF_A_RUN:
-        if (folder / name).exists():
-            os.replace(folder / name, previous / name)
+    for name in there:
+        os.replace(folder / name, previous / name)
+
+
+def _is_of_a_run(settings: Path) -> bool:
+    """Return True if a file has the settings of a run."""
+    return '"run_dir"' in settings.read_text(encoding="utf-8", errors="replace")

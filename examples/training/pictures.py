@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -42,15 +43,19 @@ def write_pictures(
     values: Values | None = None,
     **env_arguments: Any,
 ) -> None:
-    """Write ``trajectories.png``, ``episode.gif`` and, of a policy, ``values.png``."""
-    Image.fromarray(trajectories_of(driven)).save(folder / TRAJECTORIES, optimize=True)
+    """Write ``trajectories.png``, ``episode.gif`` and, of a policy, ``values.png``, all whole."""
     number, task = longest(driven)
     # The number of a task is the seed of its walkers, and of the noise.
     film = film_episode(policy, task, values=values, seed=number, **env_arguments)
-    write_animation(film.frames, folder / EPISODE, frame_time=film.frame_time, speed=4.0)
     seen = policy.policy if isinstance(policy, Filtered) else policy
-    if isinstance(seen, Policy):
-        Image.fromarray(values_over(seen, task, values)).save(folder / VALUES, optimize=True)
+    with TemporaryDirectory(dir=folder, prefix=".pictures-", suffix=".tmp") as place:
+        made = Path(place)
+        Image.fromarray(trajectories_of(driven)).save(made / TRAJECTORIES, optimize=True)
+        write_animation(film.frames, made / EPISODE, frame_time=film.frame_time, speed=4.0)
+        if isinstance(seen, Policy):
+            Image.fromarray(values_over(seen, task, values)).save(made / VALUES, optimize=True)
+        for picture in made.iterdir():
+            picture.replace(folder / picture.name)
 
 
 def trajectories_of(driven: Sequence[Drives], *, size: int = 360) -> NDArray[np.uint8]:

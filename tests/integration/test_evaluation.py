@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from mpfa_envs import evaluate as evaluate_policy
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.render import film_episode
 from mpfa_envs.robots.model import ROBOTS
+from tests.integration.run.test_full_disk import file_size
 from training import files
 from training.comparison.jobs import Evaluation, Job
 from training.evaluating import drive, on_robot, summary_row
@@ -297,6 +299,21 @@ def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
     document = evaluate.as_document([row])
     assert document["time_s"] is None
     assert document["worlds"]["A"]["timeout"] == 1.0
+
+
+def test_pictures_without_room_leave_those_before_and_name_their_folder(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    folder = run / "results"
+    words = [str(run), "--worlds", "A", "--episodes", "1", "--output", str(folder)]
+    evaluate.main(words)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with file_size(8000), pytest.raises(SystemExit) as ended:
+        files.run_script(lambda: evaluate.main(words))
+    assert ended.value.code == 1
+    assert f"{folder} cannot be written, File too large" in capsys.readouterr().err.splitlines()[-1]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 def test_the_animation_ends_with_the_episode_that_it_shows(run: Path) -> None:

@@ -80,6 +80,8 @@ class RemoteWorker:
             self.wait()
             raise Lost(str(error).strip().splitlines()[-1]) from error
         except exceptions.RayTaskError as error:
+            if (full := files.no_room(error.cause)) is not None:
+                raise full from None
             with self._log.open("a", encoding="utf-8") as log:
                 log.write(f"{error}\n")
             return 1

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shlex
+import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -273,8 +276,8 @@ def run_search(
 def _study(plan: Plan, folder: Path) -> Iterator[optuna.Study]:
     """Hold the study of a folder; no other process can write there."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with files.lock(folder):
-        file = folder / STUDY
+    file = folder / STUDY
+    with files.lock(folder), _room_for(file):
         if not file.exists() and any(folder.glob("trial-*")):
             raise ValueError(f"{folder} has trials, but not their {STUDY}: name another --folder")
         storage = optuna.storages.RDBStorage(f"sqlite:///{file}")
@@ -299,6 +302,20 @@ def _study(plan: Plan, folder: Path) -> Iterator[optuna.Study]:
         finally:
             storage.remove_session()
             storage.engine.dispose()
+
+
+@contextmanager
+def _room_for(study: Path) -> Iterator[None]:
+    """Raise ``OSError`` if the disk of a study is full, for which SQLite has its own error."""
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        if not (isinstance(cause, sqlite3.OperationalError) and "disk is full" in str(cause)):
+            raise
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(study)) from error
 
 
 def best_of(study: optuna.Study) -> FrozenTrial | None:

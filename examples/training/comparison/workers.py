@@ -21,6 +21,7 @@ from queue import SimpleQueue
 from typing import Protocol
 
 from torchrl_mpfa.stopping import SIGNALS
+from training.files import no_room
 from training.inherited import forget_single_run
 
 Command = tuple[list[str], str]
@@ -43,7 +44,12 @@ class Worker(Protocol):
         ...
 
     def ended(self) -> int | None:
-        """Return the exit status of the script, None while it runs; raise :class:`Lost` if lost."""
+        """Return the exit status of the script, None while it runs.
+
+        Raises:
+            Lost: If the script is lost.
+            OSError: If the script had no room on a disk.
+        """
         ...
 
     def stop(self) -> None:
@@ -87,12 +93,15 @@ class LocalWorker:
     def ended(self) -> int | None:
         """Return the exit status of the script, None while it runs; raise :class:`Lost` if lost."""
         try:
-            return int(self._statuses.recv()) if self._statuses.poll() else None
+            status = self._statuses.recv() if self._statuses.poll() else None
         except (EOFError, ConnectionResetError):
             process = self._process
             self.stop()
             self.wait()
             raise Lost(f"its process ended with {process and process.exitcode}") from None
+        if isinstance(status, OSError):
+            raise status
+        return status if status is None else int(status)
 
     def stop(self) -> None:
         """Ask the script to save and end, and the process with it."""
@@ -121,7 +130,7 @@ def _work(sent: Connection, statuses: Connection) -> None:
     try:
         while (command := commands.get()) is not None:
             status = _run(*command)
-            if status >= 128:
+            if isinstance(status, int) and status >= 128:
                 raise SystemExit(status)
             with suppress(BrokenPipeError):
                 statuses.send(status)
@@ -140,26 +149,28 @@ def _listen(sent: Connection, commands: SimpleQueue[Command | None]) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _run(command: list[str], log: str) -> int:
-    """Run a script as ``python`` would, and give its exit status."""
-    output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-    for stream in (1, 2):
-        os.dup2(output, stream)
-    os.close(output)
+def _run(command: list[str], log: str) -> int | OSError:
+    """Run a script as ``python`` would; return its exit status, or the error of a full disk."""
+    status: int | OSError = 0
     try:
+        output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        for stream in (1, 2):
+            os.dup2(output, stream)
+        os.close(output)
         with _unchanged():
             sys.argv = command
             runpy.run_path(command[0], run_name="__main__")
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except Exception:
-        traceback.print_exc()
-        status = 1
-    else:
-        status = 0
-    sys.stdout.flush()
+        number = end.code if isinstance(end.code, int) else int(end.code is not None)
+        status = no_room(end) or number
+    except Exception as error:
+        status = no_room(error) or 1
+        with suppress(OSError):
+            traceback.print_exc()
+    with suppress(OSError):
+        sys.stdout.flush()
     # What a run leaves has cycles, and large buffers in them. What is loaded by now is kept, and
     # need not be gone through by each collection after this one.
     gc.collect()

@@ -7,8 +7,11 @@ rows are removed, and TensorBoard hides them.
 from __future__ import annotations
 
 import io
+import math
+import os
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from torchrl_mpfa.saving import write_text_atomically
 from training import files
 
 Entry = float | torch.Tensor | NDArray[np.uint8] | Path
@@ -67,18 +69,30 @@ class CSVLog:
         """Do nothing: the logger does so after every row."""
 
     def close(self) -> None:
-        """Close the files, if there are any."""
+        """Close the files, if there are any; of a row that had no room, nothing stays."""
         if "_logger" in vars(self):
-            for file in self._logger.experiment.files.values():
-                file.close()
+            for path, file in self._logger.experiment.files.items():
+                try:
+                    file.close()
+                except OSError:  # It was raised as the row was logged.
+                    forget_after(math.inf, Path(path))
 
 
-def forget_after(actions: int, path: Path) -> None:
-    """Remove the rows of a CSV file that were logged after so many actions."""
-    rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    kept = [row for row in rows if row.endswith("\n") and int(row.partition(",")[0]) <= actions]
-    if kept != rows:
-        write_text_atomically("".join(kept), path)
+def forget_after(actions: float, path: Path) -> None:
+    """Remove the rows of a CSV file that were logged after so many actions, and half a row.
+
+    They are the last ones. The file is cut in one step, for which a full disk has room; a file
+    without a row is removed.
+    """
+
+    def is_kept(row: bytes) -> bool:
+        return row.endswith(b"\n") and int(row.partition(b",")[0]) <= actions
+
+    rows = path.read_bytes().splitlines(keepends=True)
+    if size := sum(map(len, takewhile(is_kept, rows))):
+        os.truncate(path, size)
+    else:
+        path.unlink()
 
 
 class TensorboardLog:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
 from training.evaluating import Drives
+from training.files import no_room
 from training.plugins import OwnSignals
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import showing
@@ -158,7 +160,8 @@ class TrainingRun:
     def train(self) -> bool:
         """Run to the end of the curriculum, or until asked to stop.
 
-        Whatever ends it, the run is saved as it is then, unless an error broke its parts.
+        Whatever ends it, the run is saved as it is then, unless an error broke its parts. After a
+        full disk the checkpoint before counts: the logs of this iteration may not be whole.
         """
         with self.stop.listening():
             try:
@@ -166,8 +169,8 @@ class TrainingRun:
                 while not self.schedule.finished and not self.stop:
                     self._iterate()
                     self._call(("on_iteration",))
-            except Exception:
-                if is_sound(self.learner):
+            except Exception as error:
+                if is_sound(self.learner) and no_room(error) is None:
                     save(self)
                 raise
         self._call(("on_end",))
@@ -305,6 +308,7 @@ class TrainingRun:
 
     def close(self) -> None:
         """Release the simulation and what the hooks hold."""
-        self.robots.close()
-        for hook in self.hooks:
-            hook.close()
+        with ExitStack() as parts:
+            for hook in reversed(self.hooks):
+                parts.callback(hook.close)
+            parts.callback(self.robots.close)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,6 +17,7 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 from torch._dynamo.exc import BackendCompilerFailed
 
@@ -81,7 +83,9 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
     elif len(runs) == 1 and not any(text.startswith(("-", "hydra")) for text in arguments):
         _end_with(lambda: start(runs[0], Path(runs[0].run_dir), hooks))
     else:
-        # Sweeps, and Hydra's other modes; Hydra composes the settings once more.
+        # Sweeps, and Hydra's other modes; Hydra composes the settings once more, and raises what
+        # it would report by a traceback of its own.
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
         if len(runs) > 1:
             forget_single_run()
 
@@ -90,7 +94,11 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
             _end_with(lambda: start(as_settings(config), folder, hooks))
 
         sys.argv[1:] = with_lines(arguments)
-        hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
+        try:
+            with files.naming("the folder of the sweep"):
+                hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
+        except HydraException as error:
+            _exit(error)
 
 
 def _end_with(run: Callable[[], int]) -> None:
@@ -105,8 +113,8 @@ def _end_with(run: Callable[[], int]) -> None:
 
 def _exit(error: Exception) -> NoReturn:
     """Print an error in one line, and exit."""
-    print(f"train.py: {error}", file=sys.stderr)
-    raise SystemExit(WRONG)
+    print(f"train.py: {' '.join(str(error).split())}", file=sys.stderr)
+    raise SystemExit(WRONG if files.no_room(error) is None else 1) from error
 
 
 def start(settings: TrainSettings, folder: Path, hooks: Sequence[Hook] = ()) -> int:
@@ -121,6 +129,7 @@ def start(settings: TrainSettings, folder: Path, hooks: Sequence[Hook] = ()) -> 
         Exit status: 0, or 128 and the number of the signal that stopped the run.
 
     Raises:
+        SystemExit: With 1 if the machine lacks what the run needs, after one line of what that is.
         Rejected: If the folder holds a run and ``overwrite`` is false, if another run is using
             it, or if the parts reject a setting.
     """
@@ -203,19 +212,18 @@ def _train(training: TrainingRun) -> int:
     """Train to the end, plot the run, print how it ended; return the exit status."""
     folder, failure = training.folder, None
     try:
-        finished = training.train()
-        _draw_charts(training)
+        # Logs may find only at their end that they cannot be written.
+        with files.naming(folder), closing(training):
+            finished = training.train()
+            _draw_charts(training)
     except KeyboardInterrupt:
         # An earlier signal asked to save first; this one ends the run.
         training.stop.signal = training.stop.signal or signal.SIGINT
         finished = False
     except Exception as error:
-        failure = outside_cause(error)
-        if failure is None:
+        if outside_cause(error) is None:
             raise
-        finished = False
-    finally:
-        training.close()
+        finished, failure = False, error
     if training.tracker.upload is not None:
         print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
@@ -231,11 +239,13 @@ def _train(training: TrainingRun) -> int:
     saved = (folder / files.CHECKPOINT).exists()
     plugin = training.settings.plugin
     words = f"resume={folder}" + (f" plugin={plugin}" if plugin else "")
-    how = f"continue with: train.py {words}" if saved else "nothing of it was saved"
+    how = f"continue with: train.py {words}" if saved else "nothing of it was saved, begin again"
     if failure is not None:
-        print(f"train.py: {failure}", file=sys.stderr)
+        print(f"train.py: {outside_cause(failure)}", file=sys.stderr)
     print(f"stopped after {training.actions} actions; {how}")
-    return training.stop.exit_status if failure is None else 1
+    if failure is not None:
+        raise SystemExit(1) from failure
+    return training.stop.exit_status
 
 
 def _draw_charts(training: TrainingRun) -> None:
@@ -266,7 +276,9 @@ def _rejecting() -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, files.FolderInUse) as error:
-        raise Rejected(" ".join(str(error).split())) from error
+        full = files.full_disk(error)
+        said = " ".join(str(error).split()) if full is None else f"{full}, {files.AGAIN}"
+        raise Rejected(said) from error
     except (MemoryError, RuntimeError) as error:
         cause = outside_cause(error)
         if cause is None:

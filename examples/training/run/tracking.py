@@ -119,6 +119,8 @@ class Tracker(Hook):
         self._log(entries, actions)
         if self._wandb is not None:
             self._wandb.keep(file, card)
+        # What cannot be written is missed now, not after the run was reported as finished.
+        self.flush()
 
     def _log(self, entries: Mapping[str, Any], actions: int) -> None:
         for log in self._logs:

@@ -6,8 +6,10 @@ import csv
 import json
 import math
 import signal
+import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +18,8 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 import pytest
+from optuna import Trial
+from optuna.exceptions import StorageInternalError
 
 import tune
 from tests.integration.comparison.test_compare import InThisProcess, alive, descendants
@@ -266,6 +270,33 @@ def test_trials_that_fail_are_told_and_three_in_a_row_end_the_search(
     fails.clear()
     assert tune.main(command(tmp_path / "tune", ranges, trials=9)) == 0
     assert list(trials_of(tmp_path / "tune")["state"][6:]) == ["COMPLETE"] * 3
+
+
+def test_a_study_on_a_full_disk_ends_in_one_line_and_goes_on_as_if_never_stopped(
+    tmp_path: Path,
+    ranges: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def without_room(*_: object) -> None:
+        database = sqlite3.connect(":memory:")
+        database.execute("PRAGMA max_page_count = 1")
+        try:
+            database.execute("CREATE TABLE trials (number)")
+        except sqlite3.OperationalError as error:
+            raise StorageInternalError("in the commit") from error
+
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    words = command(tmp_path / "study", ranges, trials=3)
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr(Trial, "report", without_room)
+        files.run_script(lambda: tune.main(words))
+    assert ended.value.code == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert f"{tmp_path / 'study' / search.STUDY} cannot be written, No space left" in line
+    assert tune.main(words) == 0
+    assert tune.main(command(tmp_path / "whole", ranges, trials=3)) == 0
+    assert trials_of(tmp_path / "study").equals(trials_of(tmp_path / "whole"))
 
 
 def test_a_trial_whose_worker_is_gone_goes_on(

@@ -23,7 +23,7 @@ from tests.integration.comparison.test_compare import (
 from tests.integration.tiny_runs import OVERRIDES
 from training import files
 from training.comparison import execution
-from training.comparison.jobs import Evaluation, Job
+from training.comparison.jobs import SCRIPTS, Evaluation, Job
 from training.comparison.workers import LocalWorker, Lost
 from training.records import read_table
 
@@ -136,6 +136,17 @@ def test_a_worker_that_is_killed_is_lost_once_and_replaced(
     worker.start([str(script)], log)
     assert end_of(worker) == 0
     assert log.read_text() == "whole\n"
+
+
+def test_a_script_whose_output_has_no_room_says_so_and_its_worker_stays(
+    worker: LocalWorker,
+) -> None:
+    help_text = [str(SCRIPTS / "train.py"), "--help"]
+    worker.start(help_text, Path("/dev/full"))
+    with pytest.raises(OSError, match="No space left on device"):
+        end_of(worker)
+    worker.start(help_text, Path("/dev/null"))
+    assert end_of(worker) == 0
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")

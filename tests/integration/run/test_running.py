@@ -112,7 +112,9 @@ def test_a_run_that_the_machine_ends_says_so_in_one_sentence_and_is_status_1(
 
     with monkeypatch.context() as patch:
         patch.setattr(TrainingRun, "_iterate", fails)
-        assert begin(tmp_path) == 1
+        with pytest.raises(SystemExit) as ended:
+            begin(tmp_path)
+    assert ended.value.code == 1
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "train.py" in line)
     assert re.search(message, line)
     assert (tmp_path / CHECKPOINT).exists()

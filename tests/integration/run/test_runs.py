@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import signal
@@ -104,19 +103,6 @@ def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
     assert (tmp_path / files.POLICY).read_bytes() == policy
 
 
-def test_a_disk_without_room_for_charts_ends_a_run_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "no space left", str(tmp_path / files.CURVE))
-
-    monkeypatch.setattr(figures, "plot_learning_curve", full)
-    assert begin(tmp_path, episodes=1) == 1
-    printed = capsys.readouterr()
-    assert printed.err.splitlines()[-1].startswith(f"train.py: {tmp_path / files.CURVE} cannot be")
-    assert f"continue with: train.py resume={tmp_path}" in printed.out
-
-
 def test_a_finished_run_without_an_episode_has_no_curve_and_is_not_trained_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -191,6 +177,8 @@ def test_a_run_begun_again_and_killed_at_once_cannot_resume_the_old_one(
     with pytest.raises(Rejected, match=f"there is no {CHECKPOINT} in {tmp_path}"):
         go_on(tmp_path)
     assert not (tmp_path / files.POLICY).exists()
+    # Nor does the next beginning put what saved nothing in the place of the old run.
+    assert begin(tmp_path, "seed=3", "overwrite=true", episodes=1) == 0
     assert (tmp_path / files.PREVIOUS / CHECKPOINT).read_bytes() == old
 
 
@@ -373,27 +361,6 @@ def test_a_killed_run_goes_on_and_signals_save(
     assert f"continue with: train.py resume={folder}" in capsys.readouterr().out
     assert read_checkpoint(folder)["schedule"]["actions"] > before
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_run_whose_disk_is_full_says_so_in_one_line_and_how_to_resume(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
-
-    def train_on(run: TrainingRun) -> bool:
-        save(run)
-        run.records = [object()]  # type: ignore[list-item]
-        full()
-        return True
-
-    monkeypatch.setattr(TrainingRun, "train", train_on)
-    monkeypatch.setattr("training.run.script.as_table", full)
-    assert begin(tmp_path) == 1
-    out, err = capsys.readouterr()
-    words = "checkpoint.pt cannot be written, No space left on device: free some of its disk"
-    assert err.splitlines()[-1] == f"train.py: {words}"
-    assert f"continue with: train.py resume={tmp_path}" in out
 
 
 @pytest.mark.parametrize("saved", [False, True])

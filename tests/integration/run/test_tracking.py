@@ -216,22 +216,6 @@ def test_a_row_that_was_cut_short_is_removed_from_a_csv_file(tmp_path: Path) -> 
     assert path.read_text() == "10,1.0\n20,0.0\n"
 
 
-def test_rows_that_cannot_be_written_again_stay_in_their_csv_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from training.run.loggers import forget_after
-
-    def full(file: object) -> None:
-        raise OSError("no space left")
-
-    path = tmp_path / "success.csv"
-    path.write_text("10,1.0\n20,0.0\n30,1.0\n")
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="no space left"):
-        forget_after(20, path)
-    assert path.read_text() == "10,1.0\n20,0.0\n30,1.0\n"
-
-
 def test_a_run_that_is_begun_anew_begins_new_logs(tmp_path: Path) -> None:
     for log in (files.CSV, files.TENSORBOARD):
         (tmp_path / log).mkdir()
