@@ -199,3 +199,13 @@ def test_batches_follow_the_generator():
         return replay.buffer.sample()["index"]
 
     assert sampled().equal(sampled())
+
+
+def test_method_with_a_hook_of_0_4_that_nothing_calls_is_rejected():
+    with pytest.raises(
+        TypeError, match=r"Old.kept_signals is not called since 0.5: name .* in KEPT"
+    ):
+
+        class Old(Method):
+            def kept_signals(self):
+                return []

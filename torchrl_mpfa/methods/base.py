@@ -77,6 +77,13 @@ class Method:
     needs_actor: ClassVar[bool] = False
     """True if the method is only for learners with an actor."""
 
+    def __init_subclass__(cls) -> None:
+        if "kept_signals" in vars(cls):
+            raise TypeError(
+                f"{cls.__name__}.kept_signals is not called since 0.5: name the signals in KEPT of "
+                "the sampler's class"
+            )
+
     def __post_init__(self) -> None:
         keep(self, **rules_of(type(self)))
 
