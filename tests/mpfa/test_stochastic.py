@@ -5,7 +5,7 @@ import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
-from tests.mpfa.losses import make_batch, make_networks
+from tests.mpfa.learning import make_batch, make_networks
 from torchrl_mpfa.networks import sample_tanh_normal
 
 
