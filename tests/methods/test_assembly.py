@@ -97,14 +97,6 @@ def test_method_of_ones_own_class_has_its_settings_and_parts():
         make_replay(Eager(), refrsh=1.0)
 
 
-def test_method_with_a_name_of_0_4_is_rejected_where_it_is_defined():
-    with pytest.raises(TypeError, match=r"Old.kept_signals\(\) is not called since 0.5: .* KEPT"):
-
-        class Old(Prioritized):
-            def kept_signals(self):
-                return []
-
-
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
 def test_storage_may_be_given_and_its_size_is_that_of_the_sampler(kind):
     storage = kind(77)
@@ -207,3 +199,13 @@ def test_batches_follow_the_generator():
         return replay.buffer.sample()["index"]
 
     assert sampled().equal(sampled())
+
+
+def test_method_with_a_hook_of_0_4_that_nothing_calls_is_rejected():
+    with pytest.raises(
+        TypeError, match=r"Old.kept_signals is not called since 0.5: name .* in KEPT"
+    ):
+
+        class Old(Method):
+            def kept_signals(self):
+                return []

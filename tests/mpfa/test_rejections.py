@@ -99,7 +99,7 @@ def test_wrong_batch_is_rejected_and_changes_nothing(buffer, change, message):
 
 def test_times_of_writing_for_half_of_the_batch_are_rejected(buffer):
     batch = write_signals(buffer.sample())
-    with rejected(buffer, ValueError, r"written_at must have one .*shape \[2\] for 4 transitions"):
+    with rejected(buffer, ValueError, r"written_at must have one .*shape \[2\] for 4 slots"):
         buffer.sampler.update_signals(
             batch["index"],
             dict(batch["signals"].items()),

@@ -90,7 +90,9 @@ class OptimizedLearner:
     ) -> None:
         self.tau = check(ABOVE_ZERO, tau=tau)
         self.networks: Any = networks
+        """Networks by name, of ``ActorCritic`` ``"actor"`` and ``"critics"``."""
         self.targets: Any = targets
+        """Target networks by the names of the networks that they follow."""
         self.optimizer = make_optimizer(optimizer, groups)
         self._rates = [group["lr"] for group in groups]
         self._program: CompiledUpdate | None = None

@@ -78,11 +78,10 @@ class Method:
     """True if the method is only for learners with an actor."""
 
     def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if hasattr(cls, "kept_signals"):
+        if "kept_signals" in vars(cls):
             raise TypeError(
-                f"{cls.__name__}.kept_signals() is not called since 0.5: name the signals in KEPT, "
-                "an attribute of the sampler's class"
+                f"{cls.__name__}.kept_signals is not called since 0.5: name the signals in KEPT of "
+                "the sampler's class"
             )
 
     def __post_init__(self) -> None:
