@@ -326,6 +326,14 @@ def test_it_does_not_drive_where_the_scan_does_not_look(
         assert command[2:] == pytest.approx(wanted, abs=1e-6)
 
 
+@pytest.mark.parametrize("view", [60.0, 120.0, 179.0])
+def test_a_filter_of_a_robot_that_sees_too_little_is_rejected(view: float) -> None:
+    narrow = replace(KOBUKI, field_of_view=view)
+    with pytest.raises(ValueError, match=f"field_of_view must be at least 180 .* got {view:.0f}"):
+        a_pilot((0.5, 0.5), robot=narrow, clearance=0.03)
+    assert not a_pilot((0.5, 0.5), robot=narrow).has_filter
+
+
 @pytest.mark.parametrize("clearance", [None, 0.03])
 def test_a_body_that_does_not_reverse_turns_on_the_spot(clearance: float | None) -> None:
     forwards = replace(KOBUKI, reverse=False)

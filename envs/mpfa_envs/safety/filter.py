@@ -15,6 +15,8 @@ from mpfa_envs.sensing.observation import Memory, observation_slices
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.robots.model import RobotModel
+
 CLEARANCE: Final = 0.03
 """Clearance of the rim that the filter keeps by default [m]."""
 _STEP: Final = math.radians(10.0)
@@ -98,12 +100,7 @@ class SafetyFilter:
         unseen = np.empty(0)
         if self.robot.can_stop:
             view = math.degrees(float(np.ptp(angles)) * len(angles) / max(len(angles) - 1, 1))
-            if view < 180.0 - 1e-6:
-                raise ValueError(
-                    "field_of_view must be at least 180 degrees for a filter, behind which "
-                    f"{self.robot.name!r} would never drive ahead, got {view:.4g}: take a lidar "
-                    "that sees more, or drive without the filter (environment.filter=0)"
-                )
+            check_view(self.robot, view)
             unseen = _unseen(angles, mount, radius)
         self._unseen = len(unseen)
         self._rims = _to_rim(angles, mount, radius)
@@ -212,6 +209,16 @@ class SafetyFilter:
         turning = rows[:, parts["angular_speed"]] * robot.max_angular_speed
         across = 0.5 * robot.wheel_base * turning
         return np.concatenate((forward - across, forward + across), axis=1)
+
+
+def check_view(robot: RobotModel, view: float) -> None:
+    """Reject a lidar's view [degrees] behind which a robot that can stop would never drive."""
+    if view < 180.0 - 1e-6:
+        raise ValueError(
+            f"field_of_view must be at least 180 degrees for a filter, behind which {robot.name!r} "
+            f"would never drive ahead, got {view:.4g}: take a lidar that sees more, or drive "
+            "without the filter (environment.filter=0; clearance=None of a Pilot, 0 of the node)"
+        )
 
 
 def _to_rim(
