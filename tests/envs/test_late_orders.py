@@ -144,7 +144,8 @@ def test_orders_act_in_their_turn_as_fast_as_the_wheels_change() -> None:
     # From 0.3 to 0.5 s it speeds up by 0.8 m/s2, then it stops and turns.
     first = orders.ahead(rest, since=0.0, until=0.5, latency=0.3)
     assert first[3] == pytest.approx(0.16) and first[0] == pytest.approx(0.016, abs=2e-3)
-    slower = orders.ahead(rest, since=0.0, until=0.5, latency=0.3, strength=0.5)
+    limits = KOBUKI.wheel_limits._replace(acceleration=0.5 * 0.8)
+    slower = orders.ahead(rest, since=0.0, until=0.5, latency=0.3, limits=limits)
     assert slower[3] == pytest.approx(0.08)
     # The right wheel comes to 0.115 m/s, the left one to a stand on its way to -0.115 m/s.
     after = orders.ahead(first, since=0.5, until=0.7, latency=0.3)

@@ -55,7 +55,8 @@ class SafetyFilter:
         clearance: Clearance of the rim to be kept [m]; a third of it where the robot passes by
             what it is nearer to already.
         samples: Speeds of each wheel among which to find another action.
-        braking: Share of the wheels' acceleration with which they slow down at least.
+        braking: Share of the wheels' acceleration with which they slow down at least. Below 1 the
+            robot's file is not exact, and it may turn more quickly than its ``turn_acceleration``.
 
     Raises:
         ValueError: If a number is out of its range, the robot can stop and sees less than 180
@@ -110,15 +111,16 @@ class SafetyFilter:
         self._directions = np.stack((np.cos(around), np.sin(around)))
         self._max_range = check_positive("max_range", max_range)
         self._near = check_positive("closeness_distance", closeness_distance)
+        limits = self.robot.wheel_limits
         self._body = Body(
-            self.robot.wheel_limits,
+            limits,
             self.robot.wheel_base,
             self.robot.radius,
             check_not_negative("clearance", clearance),
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
-            check_positive("braking", check_share("braking", braking))
-            * self.robot.wheel_limits.acceleration,
+            check_positive("braking", check_share("braking", braking)) * limits.acceleration,
+            limits if braking == 1.0 else limits._replace(turning=math.inf),
         )
         reach = _reach(self._body) + math.hypot(*mount)
         if self.robot.can_stop and reach > self._max_range:

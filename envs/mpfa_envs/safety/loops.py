@@ -30,6 +30,8 @@ class Body(NamedTuple):
     """Time steps from decision to decision."""
     braking: float
     """How fast a wheel slows down [m/s²], which may be less than how fast it speeds up."""
+    quick: WheelLimits
+    """Limits of a robot that turns more quickly than it says; else the same as its limits."""
 
 
 _PARTS = 2
@@ -38,6 +40,9 @@ _SHARE = 0.25
 """Of the clearance that is left where it is below what is kept, how much a decision may take."""
 _LEAST = 1 / 3
 """Share of the clearance that is kept in any case."""
+_CREEP = 0.1
+"""Share that a decision may take of a clearance below the least: a robot that turns on the spot may
+have a millimeter per second of forward speed, too."""
 _TURNS = 0.1
 """Weight of another turn relative to that of another forward speed. The robot steers clear rather
 than stopping: with equal weights it stands before walls."""
@@ -134,9 +139,10 @@ def _near_points(
             points[count, 0] = x
             points[count, 1] = y
             # What is nearer already may come nearer by a share of what is left, which lets the
-            # robot pass by it, but not nearer than the least.
-            left = (1.0 - _SHARE) * (away - body.radius)
-            left = max(left, _LEAST * body.clearance)
+            # robot pass by it, but hardly nearer than the least.
+            room = away - body.radius
+            left = min(_LEAST * body.clearance, (1.0 - _CREEP) * room)
+            left = max(left, (1.0 - _SHARE) * room)
             distance = min(away, kept, body.radius + left) - _TOUCH
             points[count, 2] = distance * distance
             count += 1
@@ -155,8 +161,10 @@ def _room_after(
     least = math.inf
     for state in range(counts.shape[0]):
         if counts[state] > 0:
-            room = _room_after_from(command, speeds[state], points[state, : counts[state]], body)
-            least = min(least, room)
+            near = points[state, : counts[state]]
+            least = min(least, _room_after_from(command, speeds[state], near, body, body.limits))
+            if body.quick.turning != body.limits.turning:
+                least = min(least, _room_after_from(command, speeds[state], near, body, body.quick))
     return least
 
 
@@ -166,6 +174,7 @@ def _room_after_from(
     speeds: NDArray[np.float64],  # now [m/s], [2]
     points: NDArray[np.float64],  # [P, 3]
     body: Body,
+    limits: WheelLimits,
 ) -> float:
     """As above, in one state: the robot stays off the points, and can do so afterwards.
 
@@ -174,9 +183,9 @@ def _room_after_from(
     left, right = speeds[0], speeds[1]
     x, y, heading = 0.0, 0.0, 0.0
     step = 0
-    while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
+    while step < body.repeat or (limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
         wanted = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
-        left, right = changed((left, right), wanted, body.limits, body.braking, body.time_step)
+        left, right = changed((left, right), wanted, limits, body.braking, body.time_step)
         part = body.time_step / _PARTS
         turn = (right - left) / body.wheel_base * part
         along = 0.5 * (left + right) * part
@@ -189,9 +198,9 @@ def _room_after_from(
                 if across * across + ahead * ahead < points[point, 2]:
                     return -1.0
         step += 1
-    if body.limits.slow <= 0.0:
+    if limits.slow <= 0.0:
         return _nearest(x, y, points, body.radius)
-    radius = _turning_radius(body.limits, body.wheel_base)
+    radius = _turning_radius(limits, body.wheel_base)
     kept = radius + body.radius + body.clearance
     across, along = radius * math.sin(heading), radius * math.cos(heading)
     to_left = _nearest(x - across, y + along, points, 0.0)
