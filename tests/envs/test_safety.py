@@ -252,7 +252,7 @@ def test_a_robot_too_near_that_drives_a_millimeter_a_second_may_turn_away(gap: f
     robot = replace(ROBOTS["kobuki"], reverse=False, wheel_acceleration=0.7)
     config = TaskConfig(**task(robot=robot, time_step=0.02, action_repeat=10))
     keep, beside = config.make_filter(), np.full(36, 5.0)
-    beside[14] = config.robot.radius + gap  # 35 degrees to the left of ahead.
+    beside[9] = config.robot.radius + gap  # 80 to 90 degrees to the left of ahead.
     turns = np.array((0.3, -0.3), np.float32)  # To the right.
     ordered = keep(observed(config, beside, 0.116, -0.1136), turns)
     assert ordered[0] > ordered[1]

@@ -41,8 +41,8 @@ _SHARE = 0.25
 _LEAST = 1 / 3
 """Share of the clearance that is kept in any case."""
 _CREEP = 0.1
-"""Share that a decision may take of a clearance below the least: a robot that turns on the spot may
-have a millimeter per second of forward speed, too."""
+"""Share of the least clearance, or of one below, that may be taken where the robot comes away: one
+that turns may have a millimeter per second of forward speed, too, and would stand for ever."""
 _TURNS = 0.1
 """Weight of another turn relative to that of another forward speed. The robot steers clear rather
 than stopping: with equal weights it stands before walls."""
@@ -75,15 +75,12 @@ def filter_actions(
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         chosen[robot] = actions[robot]
-        for state in range(states):
-            counts[state] = _near_points(
-                ranges[robot, state], directions, origins, speeds[robot, state], body, points[state]
-            )
+        seen = ranges[robot], directions, origins, speeds[robot]
+        _see(seen, body, 0.0, points, counts)
         # Real wheels creep while they are told to stand: what has come too near is left.
         nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
-        wants = -1.0
-        if nearest - body.radius < _LEAST * body.clearance - _GAIN:
-            wants = nearest + _GAIN
+        farther = nearest + _GAIN
+        wants = farther if farther - body.radius < _LEAST * body.clearance else -1.0
         room = _room_after(wanted[robot], speeds[robot], points, counts, body)
         if room > wants:
             continue
@@ -102,13 +99,38 @@ def filter_actions(
             to_left = _nearest(0.0, around, near, 0.0)
             side = 1.0 if to_left >= _nearest(0.0, -around, near, 0.0) else -1.0
             chosen[robot, 0], chosen[robot, 1] = -side, side
-        for k in np.argsort(gaps):
+        order = np.argsort(gaps)
+        for k in order:
             room = _room_after(commands[k], speeds[robot], points, counts, body)
             if room > wants or (not admissible and room > -1.0):
                 chosen[robot] = candidates[k]
                 admissible = True
             if room > wants:
                 break
+        if room > wants:
+            continue
+        _see(seen, body, _CREEP, points, counts)
+        for k in order:
+            if _room_after(commands[k], speeds[robot], points, counts, body) > farther:
+                chosen[robot] = candidates[k]
+                break
+
+
+@njit
+def _see(
+    # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
+    seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    body: Body,
+    creep: float,
+    points: NDArray[np.float64],  # [S, R, 3]
+    counts: NDArray[np.int64],  # [S]
+) -> None:
+    """Write the near points of each state and their numbers."""
+    ranges, directions, origins, speeds = seen
+    for state in range(len(ranges)):
+        counts[state] = _near_points(
+            ranges[state], directions, origins, speeds[state], body, creep, points[state]
+        )
 
 
 @njit
@@ -118,6 +140,7 @@ def _near_points(
     origins: NDArray[np.float64],
     speeds: NDArray[np.float64],
     body: Body,
+    creep: float,  # share that may be taken of a clearance below the least
     points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
 ) -> int:
     """Write the points that the robot may reach before it stands; their number."""
@@ -139,9 +162,9 @@ def _near_points(
             points[count, 0] = x
             points[count, 1] = y
             # What is nearer already may come nearer by a share of what is left, which lets the
-            # robot pass by it, but hardly nearer than the least.
+            # robot pass by it, but not nearer than the least.
             room = away - body.radius
-            left = min(_LEAST * body.clearance, (1.0 - _CREEP) * room)
+            left = min(_LEAST * body.clearance, (1.0 - creep) * room)
             left = max(left, (1.0 - _SHARE) * room)
             distance = min(away, kept, body.radius + left) - _TOUCH
             points[count, 2] = distance * distance
