@@ -111,6 +111,15 @@ def test_a_robot_that_stands_still_drives_back_to_where_it_came_from() -> None:
     assert pilot.decide(free, (0.55, 0.0, 0.0), (0.0, 0.0)).linear == 0.0
 
 
+def test_a_robot_that_stands_still_near_its_start_drives_back_there() -> None:
+    facts = card(robot=KOBUKI, sectors=36, field_of_view=360.0, observation_size=42)
+    pilot = Pilot(facts, lambda _: np.zeros((1, 2), np.float32), clearance=0.03)
+    pilot.begin((4.0, 0.0))
+    free, xs = Scan(-math.pi, math.pi / 180, np.full(360, 2.0)), [0.0, 0.15, *[0.3] * 60]
+    ordered = [pilot.decide(free, (x, 0.0, 0.0), (0.0, 0.0)).linear for x in xs]
+    assert min(ordered[:50]) == 0.0 and ordered[-1] < -0.1
+
+
 def test_a_command_is_the_action_as_wheel_speeds_and_twist(tmp_path: Path) -> None:
     file = exported(tmp_path)
     pilot, policy = Pilot.load(file), mpfa_envs.load_policy(file)
@@ -324,6 +333,14 @@ def test_it_does_not_drive_where_the_scan_does_not_look(
         linear, angular = 0.35 * sum(action), 0.7 * (action[1] - action[0]) / 0.23
         wanted = (linear if drives else 0.0, angular)
         assert command[2:] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("view", [60.0, 120.0, 179.0])
+def test_a_filter_of_a_robot_that_sees_too_little_is_rejected(view: float) -> None:
+    narrow = replace(KOBUKI, field_of_view=view)
+    with pytest.raises(ValueError, match=f"field_of_view must be at least 180 .* got {view:.0f}"):
+        a_pilot((0.5, 0.5), robot=narrow, clearance=0.03)
+    assert not a_pilot((0.5, 0.5), robot=narrow).has_filter
 
 
 @pytest.mark.parametrize("clearance", [None, 0.03])

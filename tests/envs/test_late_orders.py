@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from pathlib import Path
 
@@ -133,6 +134,25 @@ def test_numbers_that_are_a_little_off_touch_nothing(
     assert "touched" not in ends(pilot, late=0.2, strength=strength)
 
 
+def test_the_page_has_the_sums_of_the_rows() -> None:
+    docs, late = Path(__file__).parents[2] / "docs", ("0.0", "0.1", "0.2", "0.3")
+    kept: dict[tuple[str, str], dict[str, list[int]]] = {}
+    with (docs / "results/late.csv").open() as file:
+        for drives in csv.DictReader(file):
+            row = kept.setdefault((drives["driver"], drives["policy"]), {})
+            sums = row.setdefault(drives["latency"], [0, 0, 0])
+            for place, name in enumerate(("arrived", "tasks", "touched")):
+                sums[place] += int(drives[name])
+    text = (docs / "robot.md").read_text(encoding="utf-8").partition("Late orders, measured:")[2]
+    table = text.strip().partition("\n\n")[0].splitlines()[2:]
+    assert len(table) == len(kept) > 4
+    for line in table:
+        driver, policy, *cells, touched = (cell.strip("` ") for cell in line.strip("|").split("|"))
+        row = kept[driver.lower(), policy]
+        shown = [f"{row[time][0]} of {row[time][1]}" if time in row else "-" for time in late]
+        assert cells == shown and int(touched) == sum(sums[2] for sums in row.values())
+
+
 def test_orders_act_in_their_turn_as_fast_as_the_wheels_change() -> None:
     orders = Orders(KOBUKI)
     orders.give(0.0, 0.4, 0.0)
@@ -144,7 +164,8 @@ def test_orders_act_in_their_turn_as_fast_as_the_wheels_change() -> None:
     # From 0.3 to 0.5 s it speeds up by 0.8 m/s2, then it stops and turns.
     first = orders.ahead(rest, since=0.0, until=0.5, latency=0.3)
     assert first[3] == pytest.approx(0.16) and first[0] == pytest.approx(0.016, abs=2e-3)
-    slower = orders.ahead(rest, since=0.0, until=0.5, latency=0.3, strength=0.5)
+    limits = KOBUKI.wheel_limits._replace(acceleration=0.5 * 0.8)
+    slower = orders.ahead(rest, since=0.0, until=0.5, latency=0.3, limits=limits)
     assert slower[3] == pytest.approx(0.08)
     # The right wheel comes to 0.115 m/s, the left one to a stand on its way to -0.115 m/s.
     after = orders.ahead(first, since=0.5, until=0.7, latency=0.3)

@@ -51,7 +51,7 @@ def levels_of_points(points: np.ndarray, memory: MapMemory) -> np.ndarray:
     x = origin[0] + RESOLUTION * np.arange(columns)[:, None, None]
     y = origin[1] + RESOLUTION * np.arange(rows)[None, :, None]
     gaps = np.hypot(x - points[:, 0], y - points[:, 1]).min(axis=2) - ROBOT.radius
-    return np.searchsorted([-0.22, -0.06, 0.0], -gaps, side="right")
+    return np.searchsorted([-0.22, -0.06, 0.02], -gaps, side="right")
 
 
 def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
@@ -120,6 +120,24 @@ def test_a_path_through_a_tight_gap_costs_more_than_one_near_a_wall() -> None:
     assert levels[gap] == TIGHT
     assert path[2] == pytest.approx(cheapest(levels, end)[start] * RESOLUTION / 10)
     assert path[2] > 6.0  # Were a tight cell as cheap as one near a wall: 2 m at three times.
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("off", [0.0, 0.025, 0.05, 0.075])
+def test_a_door_ten_centimeters_wider_than_the_robot_is_open_wherever_cells_begin(
+    off: float, known: bool
+) -> None:
+    half = ROBOT.radius + 0.05
+    boxes = (Box(0.9, off + half, 1.1, 2.05), Box(0.9, -2.05, 1.1, off - half))
+    world = World(name="door", size=(6.1, 4.1), boxes=boxes)
+    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
+    memory.begin(0, world, plan=world if known else None)
+    for x in np.linspace(0.0, 2.0, 9):
+        path = scan(memory, lidar, (x, off, 0.0), (2.0, off))
+    columns, rows = np.rint((np.array((1.0, off)) - memory.arrays.origins[0]) / RESOLUTION)
+    door = memory.arrays.levels[0, int(columns), int(rows) - 1 : int(rows) + 2]
+    assert door.min() == TIGHT and door.max() == BLOCKED
+    assert path[2] < 1.0
 
 
 def test_the_path_leads_straight_to_a_visible_goal() -> None:

@@ -28,8 +28,8 @@ STANDING = [name for name in GENERATORS if name not in ("crowd", "mixed")]
 WALL = World(name="wall", size=(10.0, 10.0), boxes=(Box(1.0, -4.0, 1.5, 4.0),))
 
 
-def task(robot: str = "kobuki", **arguments: Any) -> dict[str, Any]:
-    near = ROBOTS[robot].radius
+def task(robot: str | RobotModel = "kobuki", **arguments: Any) -> dict[str, Any]:
+    near = resolve_robot(robot).radius
     return {"robot": robot, "physics": "kinematic", "closeness_distance": near, **arguments}
 
 
@@ -61,6 +61,7 @@ def drive_at_random(
     robots: int,
     view: float = 360.0,
     latency: Any = None,
+    told: RobotModel | None = None,
 ) -> float:
     """Least clearance of robots that hold a random action for a while [m]."""
     near = resolve_robot(robot).lidar_to_rim
@@ -68,6 +69,15 @@ def drive_at_random(
     arguments |= {"contact": True, "latency": latency}
     arguments["lidar"] = {"field_of_view": view, "sectors": round(view / 10.0)}
     keep = TaskConfig(**arguments).make_filter()
+    if told is not None:
+        keep = SafetyFilter(
+            told,
+            angles=ray_angles(view, 108),
+            sectors=36,
+            max_range=10.0,
+            closeness_distance=near,
+            braking=0.8,
+        )
     rng = np.random.default_rng(0)
     env = VectorNavigationEnv(robots, world=world, **arguments)
     observations, infos = env.reset(seed=0)
@@ -143,6 +153,12 @@ def test_a_random_policy_touches_nothing_whatever_the_brakes(
         ROBOTS["kobuki"], min_wheel_speed=-speed, max_wheel_speed=speed, wheel_acceleration=braking
     )
     assert drive_at_random(robot, "rooms", 4_000, physics="kinematic", robots=20) > 0.0
+
+
+def test_a_random_policy_touches_nothing_where_the_robot_turns_more_quickly_than_it_says() -> None:
+    robot = replace(ROBOTS["kobuki"], wheel_acceleration=2.0)
+    arguments = {"physics": "kinematic", "robots": 20, "told": replace(robot, turn_acceleration=1)}
+    assert drive_at_random(robot, "mazes", 4_000, **arguments) > 0.0
 
 
 @pytest.mark.parametrize("view", [180.0, 270.0, 360.0])
@@ -229,6 +245,17 @@ def test_a_robot_that_has_crept_too_near_is_ordered_away(action: tuple[float, fl
         before[17:19] = config.robot.radius + gap
         ordered = keep(observed(config, before), np.array(action, np.float32))
         assert (ordered.sum() < -0.01) == leaves
+
+
+@pytest.mark.parametrize("gap", [0.009, 0.006])
+def test_a_robot_too_near_that_drives_a_millimeter_a_second_may_turn_away(gap: float) -> None:
+    robot = replace(ROBOTS["kobuki"], reverse=False, wheel_acceleration=0.7)
+    config = TaskConfig(**task(robot=robot, time_step=0.02, action_repeat=10))
+    keep, beside = config.make_filter(), np.full(36, 5.0)
+    beside[9] = config.robot.radius + gap  # 80 to 90 degrees to the left of ahead.
+    turns = np.array((0.3, -0.3), np.float32)  # To the right.
+    ordered = keep(observed(config, beside, 0.116, -0.1136), turns)
+    assert ordered[0] > ordered[1]
 
 
 @pytest.mark.parametrize("latency", [0.1, 0.3, (0.0, 0.25)])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,8 +16,9 @@ import pytest
 
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-from mpfa_envs import Policy, export_policy
+from mpfa_envs import Policy, export_policy, load_policy
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.robots.model import ROBOTS
 from tests.envs.exported import ENV_ARGUMENTS
 from tests.ros.fake_rclpy import World, install
 
@@ -91,6 +94,20 @@ def driving(module: Any, world: World, frame: str = "odom") -> Any:
     node = module.PolicyNode()
     begin(node, world, frame)
     return node
+
+
+def test_a_robot_that_sees_too_little_for_its_filter_is_rejected_at_the_start(
+    module: Any, world: World, tmp_path: Path
+) -> None:
+    file = export_policy(load_policy("td3-rooms"), tmp_path / "rooms.onnx")
+    narrow = tmp_path / "narrow.yaml"
+    fields = asdict(replace(ROBOTS["kobuki"], name="narrow", field_of_view=120.0))
+    narrow.write_text(
+        json.dumps({name: value for name, value in fields.items() if value is not None})
+    )
+    world.parameters |= {"policy": str(file), "robot": str(narrow), "clearance": 0.03}
+    with pytest.raises(ValueError, match=r"field_of_view must be at least 180 .* clearance=None"):
+        module.PolicyNode()
 
 
 def test_it_stops_the_robot_when_it_dies_of_an_exception(module: Any, world: World) -> None:

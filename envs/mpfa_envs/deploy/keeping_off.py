@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from mpfa_envs.deploy.pace import turning, widening
 from mpfa_envs.robots.orders import STRENGTH
-from mpfa_envs.safety.filter import SafetyFilter
+from mpfa_envs.safety.filter import SafetyFilter, check_view
 from mpfa_envs.sensing.lidar import ray_angles
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def filter_of(
             f"{learned.min_wheel_speed} m/s at least: no filter can promise that it touches "
             f"nothing, got {clearance}"
         )
+    check_view(robot, robot.field_of_view)
     braking = robot.wheel_limits.acceleration / widening(robot, learned)
     braking = min(learned.wheel_limits.acceleration, braking / pace**2)
     turns = min(turning(learned), turning(robot) / pace**2)

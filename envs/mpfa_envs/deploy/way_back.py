@@ -45,9 +45,10 @@ class WayBack:
         waits = time - self._since >= STANDING_TIME
         # Wheels that only turn forward cannot turn it on the spot, either.
         if self._target is None and waits and robot.min_wheel_speed < 0.0 and self.stands_still:
-            # What it has driven it has seen.
+            # What it has driven it has seen. Near its start there is no place far enough away.
             away = (place for place in reversed(self._places) if math.dist(place, (x, y)) >= _BACK)
-            self._target, self._since, self._stood = next(away, None), time, (x, y)
+            farthest = max(self._places, key=lambda place: math.dist(place, (x, y)))
+            self._target, self._since, self._stood = next(away, farthest), time, (x, y)
         driven = math.dist(self._stood, (x, y)) >= 0.8 * _BACK
         if self._target is None or driven or time - self._since >= _BACK_TIME:
             self._target = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.robots.motion_loops import WheelLimits
 
 STRENGTH: Final = 0.8
 """Share of their acceleration that a real robot's wheels have at least."""
@@ -51,12 +53,15 @@ class Orders:
         certain: bool,
     ) -> NDArray[np.float64]:
         """Motions that the robot may have when an order of now acts, ``[S, 5]``."""
-        assumed = [(latency, 1.0)]
+        limits = self._robot.wheel_limits
+        assumed = [(latency, limits)]
         if not certain:
-            assumed += [(latency + _OFF, STRENGTH), (max(latency - _OFF, 0.0), 1.0)]
+            slow = limits._replace(acceleration=STRENGTH * limits.acceleration)
+            early, quick = max(latency - _OFF, 0.0), limits._replace(turning=math.inf)
+            assumed += [(latency + _OFF, slow), (early, quick)]
         rows = [
-            self.ahead(motion, since=now - age, until=now + late, latency=late, strength=strength)
-            for late, strength in assumed
+            self.ahead(motion, since=now - age, until=now + late, latency=late, limits=limits)
+            for late, limits in assumed
         ]
         return np.array(rows)
 
@@ -67,7 +72,7 @@ class Orders:
         since: float,  # time of the motion [s]
         until: float,  # [s]
         latency: float,  # from an order to the wheels [s]
-        strength: float = 1.0,  # share of the acceleration that the wheels have
+        limits: WheelLimits | None = None,  # None: those of the robot
     ) -> NDArray[np.float64]:
         """The motion, ``[5]``, at a later time."""
         times, orders = [], []
@@ -83,9 +88,7 @@ class Orders:
             order = left, right
         times.append(until - begin)
         orders.append(order)
-        limits = self._robot.wheel_limits
-        limits = limits._replace(acceleration=strength * limits.acceleration)
-        base = self._robot.wheel_base
+        limits, base = limits or self._robot.wheel_limits, self._robot.wheel_base
         return drive_orders(motion, np.array(times), np.array(orders), limits, base, _TIME_STEP)
 
 

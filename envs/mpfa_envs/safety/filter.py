@@ -15,6 +15,8 @@ from mpfa_envs.sensing.observation import Memory, observation_slices
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.robots.model import RobotModel
+
 CLEARANCE: Final = 0.03
 """Clearance of the rim that the filter keeps by default [m]."""
 _STEP: Final = math.radians(10.0)
@@ -53,7 +55,8 @@ class SafetyFilter:
         clearance: Clearance of the rim to be kept [m]; a third of it where the robot passes by
             what it is nearer to already.
         samples: Speeds of each wheel among which to find another action.
-        braking: Share of the wheels' acceleration with which they slow down at least.
+        braking: Share of the wheels' acceleration with which they slow down at least. Below 1 the
+            robot's file is not exact, and it may turn more quickly than its ``turn_acceleration``.
 
     Raises:
         ValueError: If a number is out of its range, the robot can stop and sees less than 180
@@ -98,12 +101,7 @@ class SafetyFilter:
         unseen = np.empty(0)
         if self.robot.can_stop:
             view = math.degrees(float(np.ptp(angles)) * len(angles) / max(len(angles) - 1, 1))
-            if view < 180.0 - 1e-6:
-                raise ValueError(
-                    "field_of_view must be at least 180 degrees for a filter, behind which "
-                    f"{self.robot.name!r} would never drive ahead, got {view:.4g}: take a lidar "
-                    "that sees more, or drive without the filter (environment.filter=0)"
-                )
+            check_view(self.robot, view)
             unseen = _unseen(angles, mount, radius)
         self._unseen = len(unseen)
         self._rims = _to_rim(angles, mount, radius)
@@ -113,15 +111,16 @@ class SafetyFilter:
         self._directions = np.stack((np.cos(around), np.sin(around)))
         self._max_range = check_positive("max_range", max_range)
         self._near = check_positive("closeness_distance", closeness_distance)
+        limits = self.robot.wheel_limits
         self._body = Body(
-            self.robot.wheel_limits,
+            limits,
             self.robot.wheel_base,
             self.robot.radius,
             check_not_negative("clearance", clearance),
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
-            check_positive("braking", check_share("braking", braking))
-            * self.robot.wheel_limits.acceleration,
+            check_positive("braking", check_share("braking", braking)) * limits.acceleration,
+            limits if braking == 1.0 else limits._replace(turning=math.inf),
         )
         reach = _reach(self._body) + math.hypot(*mount)
         if self.robot.can_stop and reach > self._max_range:
@@ -212,6 +211,16 @@ class SafetyFilter:
         turning = rows[:, parts["angular_speed"]] * robot.max_angular_speed
         across = 0.5 * robot.wheel_base * turning
         return np.concatenate((forward - across, forward + across), axis=1)
+
+
+def check_view(robot: RobotModel, view: float) -> None:
+    """Reject a lidar's view [degrees] behind which a robot that can stop would never drive."""
+    if view < 180.0 - 1e-6:
+        raise ValueError(
+            f"field_of_view must be at least 180 degrees for a filter, behind which {robot.name!r} "
+            f"would never drive ahead, got {view:.4g}: take a lidar that sees more, or drive "
+            "without the filter (environment.filter=0; clearance=None of a Pilot, 0 of the node)"
+        )
 
 
 def _to_rim(

@@ -30,6 +30,8 @@ class Body(NamedTuple):
     """Time steps from decision to decision."""
     braking: float
     """How fast a wheel slows down [m/s²], which may be less than how fast it speeds up."""
+    quick: WheelLimits
+    """Limits of a robot that turns more quickly than it says; else the same as its limits."""
 
 
 _PARTS = 2
@@ -38,6 +40,9 @@ _SHARE = 0.25
 """Of the clearance that is left where it is below what is kept, how much a decision may take."""
 _LEAST = 1 / 3
 """Share of the clearance that is kept in any case."""
+_CREEP = 0.1
+"""Share of the least clearance, or of one below, that may be taken where the robot comes away: one
+that turns may have a millimeter per second of forward speed, too, and would stand for ever."""
 _TURNS = 0.1
 """Weight of another turn relative to that of another forward speed. The robot steers clear rather
 than stopping: with equal weights it stands before walls."""
@@ -70,15 +75,12 @@ def filter_actions(
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         chosen[robot] = actions[robot]
-        for state in range(states):
-            counts[state] = _near_points(
-                ranges[robot, state], directions, origins, speeds[robot, state], body, points[state]
-            )
+        seen = ranges[robot], directions, origins, speeds[robot]
+        _see(seen, body, 0.0, points, counts)
         # Real wheels creep while they are told to stand: what has come too near is left.
         nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
-        wants = -1.0
-        if nearest - body.radius < _LEAST * body.clearance - _GAIN:
-            wants = nearest + _GAIN
+        farther = nearest + _GAIN
+        wants = farther if farther - body.radius < _LEAST * body.clearance else -1.0
         room = _room_after(wanted[robot], speeds[robot], points, counts, body)
         if room > wants:
             continue
@@ -97,13 +99,38 @@ def filter_actions(
             to_left = _nearest(0.0, around, near, 0.0)
             side = 1.0 if to_left >= _nearest(0.0, -around, near, 0.0) else -1.0
             chosen[robot, 0], chosen[robot, 1] = -side, side
-        for k in np.argsort(gaps):
+        order = np.argsort(gaps)
+        for k in order:
             room = _room_after(commands[k], speeds[robot], points, counts, body)
             if room > wants or (not admissible and room > -1.0):
                 chosen[robot] = candidates[k]
                 admissible = True
             if room > wants:
                 break
+        if room > wants:
+            continue
+        _see(seen, body, _CREEP, points, counts)
+        for k in order:
+            if _room_after(commands[k], speeds[robot], points, counts, body) > farther:
+                chosen[robot] = candidates[k]
+                break
+
+
+@njit
+def _see(
+    # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
+    seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    body: Body,
+    creep: float,
+    points: NDArray[np.float64],  # [S, R, 3]
+    counts: NDArray[np.int64],  # [S]
+) -> None:
+    """Write the near points of each state and their numbers."""
+    ranges, directions, origins, speeds = seen
+    for state in range(len(ranges)):
+        counts[state] = _near_points(
+            ranges[state], directions, origins, speeds[state], body, creep, points[state]
+        )
 
 
 @njit
@@ -113,6 +140,7 @@ def _near_points(
     origins: NDArray[np.float64],
     speeds: NDArray[np.float64],
     body: Body,
+    creep: float,  # share that may be taken of a clearance below the least
     points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
 ) -> int:
     """Write the points that the robot may reach before it stands; their number."""
@@ -135,8 +163,9 @@ def _near_points(
             points[count, 1] = y
             # What is nearer already may come nearer by a share of what is left, which lets the
             # robot pass by it, but not nearer than the least.
-            left = (1.0 - _SHARE) * (away - body.radius)
-            left = max(left, _LEAST * body.clearance)
+            room = away - body.radius
+            left = min(_LEAST * body.clearance, (1.0 - creep) * room)
+            left = max(left, (1.0 - _SHARE) * room)
             distance = min(away, kept, body.radius + left) - _TOUCH
             points[count, 2] = distance * distance
             count += 1
@@ -155,8 +184,10 @@ def _room_after(
     least = math.inf
     for state in range(counts.shape[0]):
         if counts[state] > 0:
-            room = _room_after_from(command, speeds[state], points[state, : counts[state]], body)
-            least = min(least, room)
+            near = points[state, : counts[state]]
+            least = min(least, _room_after_from(command, speeds[state], near, body, body.limits))
+            if body.quick.turning != body.limits.turning:
+                least = min(least, _room_after_from(command, speeds[state], near, body, body.quick))
     return least
 
 
@@ -166,6 +197,7 @@ def _room_after_from(
     speeds: NDArray[np.float64],  # now [m/s], [2]
     points: NDArray[np.float64],  # [P, 3]
     body: Body,
+    limits: WheelLimits,
 ) -> float:
     """As above, in one state: the robot stays off the points, and can do so afterwards.
 
@@ -174,9 +206,9 @@ def _room_after_from(
     left, right = speeds[0], speeds[1]
     x, y, heading = 0.0, 0.0, 0.0
     step = 0
-    while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
+    while step < body.repeat or (limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
         wanted = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
-        left, right = changed((left, right), wanted, body.limits, body.braking, body.time_step)
+        left, right = changed((left, right), wanted, limits, body.braking, body.time_step)
         part = body.time_step / _PARTS
         turn = (right - left) / body.wheel_base * part
         along = 0.5 * (left + right) * part
@@ -189,9 +221,9 @@ def _room_after_from(
                 if across * across + ahead * ahead < points[point, 2]:
                     return -1.0
         step += 1
-    if body.limits.slow <= 0.0:
+    if limits.slow <= 0.0:
         return _nearest(x, y, points, body.radius)
-    radius = _turning_radius(body.limits, body.wheel_base)
+    radius = _turning_radius(limits, body.wheel_base)
     kept = radius + body.radius + body.clearance
     across, along = radius * math.sin(heading), radius * math.cos(heading)
     to_left = _nearest(x - across, y + along, points, 0.0)

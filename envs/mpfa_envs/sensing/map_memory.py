@@ -21,8 +21,12 @@ RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
 _MARGIN: Final = 5
 """Cells around the room: where it ends is not known before a wall was seen."""
+_BLOCKED: Final = -0.02
+"""Clearance of the robot's rim at or below which a cell is blocked [m]. A cell holds places up to
+half its side farther from a wall than its middle: with 0 a door 0.1 m wider than the robot would be
+blocked or not by where the map begins."""
 _TIGHT: Final = 0.06
-"""Clearance of the robot's rim below which a cell is tight [m]."""
+"""Clearance below which a cell is tight [m]."""
 _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
 
@@ -42,12 +46,12 @@ class Sketch(NamedTuple):
 class MapMemory:
     """A map for each of many robots, empty when an episode begins, or as a plan says.
 
-    The map has square cells. Where the robot's center cannot be, as its rim would touch a point
-    that the lidar hit, a cell is blocked; unseen cells count as free. The path is the cheapest one
-    to the goal over the map, where cells near an obstacle cost three times as much as free ones,
-    tight ones thirty and blocked ones two hundred times, found again whenever a scan makes it
-    costlier. Its direction is that of the farthest of its next cells, two meters away at most, to
-    which a straight line is no narrower than its ends.
+    The map has square cells. Where the robot's center cannot be, as a point that the lidar hit
+    would be 2 cm inside its rim, a cell is blocked; unseen cells count as free. The path is the
+    cheapest one to the goal over the map, where cells near an obstacle cost three times as much as
+    free ones, tight ones thirty and blocked ones two hundred times, found again whenever a scan
+    makes it costlier. Its direction is that of the farthest of its next cells, two meters away at
+    most, to which a straight line is no narrower than its ends.
 
     It knows of the room only the scans, entered at the poses that odometry gives, and its plan if
     it is given. Scans add what the plan does not have; what it has too much stays, at the cost of
@@ -81,7 +85,8 @@ class MapMemory:
         """The maps, as compiled loops read them."""
         self._paths = np.zeros((count, 3))
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
-        bounds = robot.radius, robot.radius + _TIGHT, robot.radius + _NEAR
+        radius = robot.radius
+        bounds = radius + _BLOCKED, radius + _TIGHT, radius + _NEAR
         self._lengths = RESOLUTION, *bounds, lidar.max_range
         self._mount = lidar.mount
 
