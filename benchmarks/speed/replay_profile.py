@@ -41,7 +41,7 @@ UPDATE: tuple[Part, ...] = (
     ("rows that are not stale", SignalTable, "live_rows"),
     ("new signals, Eqs. (13)-(14)", SignalTable, "fill_learned"),
     ("checks of the signals", SignalTable, "check_fused"),
-    ("fusion, Eq. (21)", MPFASampler, "_combined"),
+    ("fusion, Eq. (21)", MPFASampler, "combined"),
     ("boost, Eq. (22)", PositiveBoost, "__call__"),
     ("decay, Eqs. (23)-(24)", PositiveDecay, "__call__"),
     ("three trees and priorities, Eq. (8)", MPFASampler, "_set"),

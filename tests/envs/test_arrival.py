@@ -15,7 +15,7 @@ from mpfa_envs import ROBOTS, Box, RobotModel, World
 from mpfa_envs.deploy import Pilot, Scan
 from mpfa_envs.robots.drives import KinematicDrives
 from tests.envs.exported import card
-from tests.envs.test_deploy import ALL_ROUND, KOBUKI, a_pilot, wall_at
+from tests.envs.test_deploy_filter import ALL_ROUND, KOBUKI, a_pilot, wall_at
 
 
 def drive_to(pilot: Pilot, start: tuple[float, float, float], timeout: float = 60.0) -> Any:

@@ -10,10 +10,8 @@ from torch import Tensor
 from torchrl_mpfa.adjustment import PositiveBoost
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.samplers.fused import SignalSampler, Weighing
-
-_ENOUGH = 1000
-"""With fewer rewards there is no warning that all are on one side."""
+    from torchrl_mpfa.samplers.fused import SignalSampler
+    from torchrl_mpfa.samplers.weighing import Weighing
 
 
 def composition(
@@ -56,25 +54,3 @@ def composition(
         "sampled_age_max": float(age.max()),
         "replay_count_mean": float(rows[:, table.count_column].mean()),
     }
-
-
-def one_sided(sampler: SignalSampler) -> str | None:
-    """Return a warning if all rewards of a buffer are on one side of the level of a sampler.
-
-    There is none for few rewards, nor for rewards that are all equal, which no level separates.
-    """
-    level, rewards = sampler.positive_above, sampler.table.rewards
-    used = sampler.fusion.uses_level or any(part.uses_level for part in sampler.adjustments)
-    if level == "mean" or not used or len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
-        return None
-    above = int((rewards > level).sum())
-    # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
-    waits = above == 0 and level > 0 and not sampler.fusion.uses_level
-    if waits or 0 < above < len(rewards):
-        return None
-    return (
-        f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
-        f"above {level}: by Eq. (17) TD error and gradient get no weight next to the "
-        "reward, and boost and decay separate no transitions. Set positive_above to a "
-        "level between the rewards, or to 'mean', with which all weights are equal"
-    )

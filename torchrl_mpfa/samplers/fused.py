@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, get_args
 
 import torch
@@ -22,30 +22,14 @@ from torchrl_mpfa.checks import (
     check_index,
     unknown,
 )
-from torchrl_mpfa.fusion import FixedFusion, Fusion, checked_weights, fuse
-from torchrl_mpfa.samplers.composition import composition, one_sided
+from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
+from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
+from torchrl_mpfa.samplers.weighing import Weighing, weigh
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import REWARD, Signal, as_signals
-
-# With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
-# capacity.
-_COUNT_REFRESH = 1 / 16
-_NO_WEIGHTS = torch.empty(0)
-
-
-@dataclass(frozen=True)
-class Weighing:
-    """Results of the last passes over the buffer, and the state of the buffer at each of them."""
-
-    weights: Tensor = _NO_WEIGHTS  # One per fused signal, in the order of their columns, [K].
-    mean_reward: float = 0.0
-    writes: int = 0  # Transitions that had been written when the weights were computed.
-    counted: tuple[Tensor | None, ...] = ()  # One result per adjustment, None if it has none.
-    counted_writes: int = 0  # Transitions that had been written when the adjustments counted.
-    learned_since: int = 0  # Transitions that were learned from since then.
 
 
 class SignalSampler(TreeSampler):
@@ -280,14 +264,15 @@ class SignalSampler(TreeSampler):
         """Set priorities directly, see :meth:`TreeSampler.update_priority`."""
         # TorchRL's buffers hand a first priority to transitions that they find in a storage.
         if not self._attached and self._highest is not None:
-            self._warn_once(
+            self.warn_once(
                 f"{type(self).__name__} was given one number as the priority: it is neither fused "
                 "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. Use "
                 "SignalReplayBuffer"
             )
         super().update_priority(index, priority, storage=storage)
 
-    def _warn_once(self, text: str) -> None:
+    def warn_once(self, text: str) -> None:
+        """Warn of something that this sampler has not yet warned of."""
         if text not in self._warned:
             self._warned.add(text)
             warnings.warn(text, UserWarning, stacklevel=3)
@@ -340,7 +325,7 @@ class SignalSampler(TreeSampler):
         for group_slots, group_rows in groups:
             if len(group_slots):
                 first_batch = group_slots[: len(group_slots) // together]
-                weighing = self._weigh(table, first_batch, weighing)  # Eqs. (15)-(20).
+                weighing = weigh(self, first_batch, weighing)  # Eqs. (15)-(20).
                 # Eqs. (21)-(24).
                 priorities.append(self._fused(table, group_rows, group_slots, weighing, together))
         priority = priorities[0] if len(priorities) == 1 else torch.cat(priorities)
@@ -366,7 +351,7 @@ class SignalSampler(TreeSampler):
     ) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
         shape = (batches, -1) if batches > 1 else slots.shape
-        priority = self._combined(rows, weighing).view(shape)
+        priority = self.combined(rows, weighing).view(shape)
         facts = BatchFacts(
             reward=rows.select(1, table.reward_column).view(shape),
             replay_count=rows.select(1, table.count_column).view(shape),
@@ -385,43 +370,9 @@ class SignalSampler(TreeSampler):
                 )
         return priority.to(torch.double).reshape(-1)
 
-    def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
+    def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""
         return fuse(rows[:, self.table.fused], weighing.weights, eps=self._eps)
-
-    def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
-        """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
-        weighing = last or Weighing()
-        changed = table.writes - weighing.writes
-        kept = 0 <= changed <= self.entropy_refresh * table.size and self.entropy_refresh > 0
-        due = last is None or not kept
-        if due or self.fusion.every_batch:
-            weights = checked_weights(self.fusion, self._names, table, index)
-            weighing = replace(weighing, weights=weights)
-        if due:
-            if (text := one_sided(self)) is not None:
-                self._warn_once(text)
-            mean = float(table.rewards.mean())
-            weighing = replace(weighing, mean_reward=mean, writes=table.writes)
-        return self._count(table, len(index), weighing) if any(self._counting) else weighing
-
-    def _count(self, table: SignalTable, learned: int, last: Weighing) -> Weighing:
-        """Have the adjustments count the buffer again if enough of it changed."""
-        changed = table.writes - last.counted_writes + last.learned_since
-        few = 0 <= changed <= _COUNT_REFRESH * table.size and self.entropy_refresh > 0
-        if last.counted and few:
-            return replace(last, learned_since=last.learned_since + learned)
-        fused = self._combined(table.rows[: table.size], last)
-        counted = [
-            adjust.count(table, fused) if counts else None
-            for adjust, counts in zip(self.adjustments, self._counting, strict=True)
-        ]
-        for value in counted:
-            if value is not None:
-                check_finite("what an adjustment counted", value)
-        return replace(
-            last, counted=tuple(counted), counted_writes=table.writes, learned_since=learned
-        )
 
     def stats(self) -> dict[str, float]:
         """Return the composition of buffer and last batch by name, see ``docs/metrics.md``."""

@@ -1,0 +1,92 @@
+"""Weights of the signals, and when they are counted over the buffer again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.checks import check_finite
+from torchrl_mpfa.fusion import checked_weights
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.samplers.fused import SignalSampler
+
+# With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
+# capacity.
+_COUNT_REFRESH = 1 / 16
+_ENOUGH = 1000
+"""With fewer rewards there is no warning that all are on one side."""
+_NO_WEIGHTS = torch.empty(0)
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Results of the last passes over the buffer, and the state of the buffer at each of them."""
+
+    weights: Tensor = _NO_WEIGHTS  # One per fused signal, in the order of their columns, [K].
+    mean_reward: float = 0.0
+    writes: int = 0  # Transitions that had been written when the weights were computed.
+    counted: tuple[Tensor | None, ...] = ()  # One result per adjustment, None if it has none.
+    counted_writes: int = 0  # Transitions that had been written when the adjustments counted.
+    learned_since: int = 0  # Transitions that were learned from since then.
+
+
+def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weighing:
+    """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
+    table, refresh = sampler.table, sampler.entropy_refresh
+    weighing = last or Weighing()
+    changed = table.writes - weighing.writes
+    due = last is None or refresh == 0 or not 0 <= changed <= refresh * table.size
+    if due or sampler.fusion.every_batch:
+        names = table.names[table.fused]
+        weighing = replace(weighing, weights=checked_weights(sampler.fusion, names, table, index))
+    if due:
+        if (text := one_sided(sampler)) is not None:
+            sampler.warn_once(text)
+        mean = float(table.rewards.mean())
+        weighing = replace(weighing, mean_reward=mean, writes=table.writes)
+    if not any(adjust.counts for adjust in sampler.adjustments):
+        return weighing
+    return _count(sampler, len(index), weighing)
+
+
+def _count(sampler: SignalSampler, learned: int, last: Weighing) -> Weighing:
+    """Have the adjustments count the buffer again if enough of it changed."""
+    table = sampler.table
+    changed = table.writes - last.counted_writes + last.learned_since
+    few = 0 <= changed <= _COUNT_REFRESH * table.size and sampler.entropy_refresh > 0
+    if last.counted and few:
+        return replace(last, learned_since=last.learned_since + learned)
+    fused = sampler.combined(table.rows[: table.size], last)
+    counted = [
+        adjust.count(table, fused) if adjust.counts else None for adjust in sampler.adjustments
+    ]
+    for value in counted:
+        if value is not None:
+            check_finite("what an adjustment counted", value)
+    return replace(last, counted=tuple(counted), counted_writes=table.writes, learned_since=learned)
+
+
+def one_sided(sampler: SignalSampler) -> str | None:
+    """Return a warning if all rewards of a buffer are on one side of the level of a sampler.
+
+    There is none for few rewards, nor for rewards that are all equal, which no level separates.
+    """
+    level, rewards = sampler.positive_above, sampler.table.rewards
+    used = sampler.fusion.uses_level or any(part.uses_level for part in sampler.adjustments)
+    if level == "mean" or not used or len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
+        return None
+    above = int((rewards > level).sum())
+    # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
+    waits = above == 0 and level > 0 and not sampler.fusion.uses_level
+    if waits or 0 < above < len(rewards):
+        return None
+    return (
+        f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
+        f"above {level}: by Eq. (17) TD error and gradient get no weight next to the "
+        "reward, and boost and decay separate no transitions. Set positive_above to a "
+        "level between the rewards, or to 'mean', with which all weights are equal"
+    )
