@@ -20,6 +20,7 @@ from torchrl_mpfa.checks import (
     check_counts,
     check_finite,
     check_index,
+    check_shape,
     unknown,
 )
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
@@ -117,15 +118,16 @@ class SignalSampler(TreeSampler):
         fused = [signal.name for signal in self.signals]
         self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
         if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {type(fusion).__name__}")
+            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {fusion!r}")
         for name in self.fusion.signal_names:
             if name not in fused:
                 raise ValueError(unknown("signal of the fusion", name, fused))
+        listed = isinstance(adjustments, Sequence)
+        if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
+            raise TypeError(
+                f"adjustments must be a list of torchrl_mpfa.Adjustment, got {adjustments!r}"
+            )
         self.adjustments = tuple(adjustments)
-        for adjust in self.adjustments:
-            if not isinstance(adjust, Adjustment):
-                kind = type(adjust).__name__
-                raise TypeError(f"adjustments must be torchrl_mpfa.Adjustment, got {kind}")
         self.positive_above: Level = check(LEVEL, positive_above=positive_above)
         if self.positive_above == "mean" and self.fusion.uses_level:
             warnings.warn(
@@ -363,12 +365,8 @@ class SignalSampler(TreeSampler):
         for place, adjust in enumerate(self.adjustments):
             if weighing.counted:
                 facts = replace(facts, counted=weighing.counted[place])
-            priority = adjust(priority, facts)
-            if priority.shape != slots.shape:
-                raise ValueError(
-                    f"adjusted priorities must have shape {[*slots.shape]}, got "
-                    f"{[*priority.shape]} from {type(adjust).__name__}"
-                )
+            name = f"priorities of {type(adjust).__name__}"
+            priority = check_shape(name, adjust(priority, facts), slots.shape)
         return priority.to(torch.double).reshape(-1)
 
     def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
