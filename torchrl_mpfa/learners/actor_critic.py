@@ -177,7 +177,10 @@ class ActorCritic(OptimizedLearner):
         check_networks(actor, critic)
         self.stochastic = isinstance(actor, ProbabilisticTensorDictSequential)
         if unknown := [name for name in signals if name not in KNOWN_SIGNALS]:
-            raise ValueError(f"signals must be among {KNOWN_SIGNALS}, got {unknown}")
+            raise ValueError(
+                f"signals must be among {KNOWN_SIGNALS}, got {unknown}: write a signal of "
+                "your own in the batch after update(...)"
+            )
         self.signals = tuple(signals)
         if loss_function not in DISTANCES:
             raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")
