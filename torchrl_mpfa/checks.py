@@ -143,7 +143,7 @@ def check_shape(name: str, value: Any, shape: Sequence[int]) -> Tensor:
     """Return a tensor of this shape; reject anything else by name."""
     if isinstance(value, Tensor) and value.shape == torch.Size(shape):
         return value
-    got = f"shape {[*value.shape]}" if isinstance(value, Tensor) else repr(value)
+    got = f"shape {[*value.shape]}" if isinstance(value, Tensor) else type(value).__name__
     raise ValueError(f"{name} must be a tensor of shape {[*shape]}, got {got}")
 
 
