@@ -128,7 +128,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         )
 
     def _initialize_prioritized_sampler(self) -> None:
-        # As long as TorchRL can still undo what it has made: it may have put that off to this use.
+        # Here an error leaves the buffer uninitialized, also where delayed_init put the parts off.
         if self._fuses:
             self._check_fusing_parts()
         super()._initialize_prioritized_sampler()
@@ -160,7 +160,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     @property
     def _fuses(self) -> bool:
-        # Not the attribute: the property has the parts made, where that was put off to their use.
+        # The property, not the attribute: with delayed_init the parts are made at their first use.
         return isinstance(self.sampler, SignalSampler)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
@@ -361,7 +361,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             numbers, device = state["_rng"]
             generator = torch.Generator(device=device)
             generator.set_state(numbers)
-        sampler = self.sampler  # Made here, if the parts were put off to their first use.
+        sampler = self.sampler  # With delayed_init the parts are made here.
         with self._replay_lock, self._write_lock:
             before = deepcopy(self._transform.state_dict()), self._memory.copies()
             try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from numbers import Integral
 from typing import Any
@@ -137,6 +137,14 @@ def check_index(index: Tensor, size: int) -> Tensor:
     if low < -1 or high >= size:
         raise IndexError(f"index must be in [0, {size}), got {low if low < -1 else high}")
     return index[index >= 0] if low == -1 else index
+
+
+def check_shape(name: str, value: Any, shape: Sequence[int]) -> Tensor:
+    """Return a tensor of this shape; reject anything else by name."""
+    if isinstance(value, Tensor) and value.shape == torch.Size(shape):
+        return value
+    got = f"shape {[*value.shape]}" if isinstance(value, Tensor) else type(value).__name__
+    raise ValueError(f"{name} must be a tensor of shape {[*shape]}, got {got}")
 
 
 def as_mask(name: str, value: Any) -> Tensor:

@@ -38,7 +38,15 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import Level
-from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, Rule, check, check_finite, keep
+from torchrl_mpfa.checks import (
+    BELOW_ONE,
+    NOT_NEGATIVE,
+    Rule,
+    check,
+    check_finite,
+    check_shape,
+    keep,
+)
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -210,7 +218,8 @@ class Fusion:
 
         Args:
             names: The K signals that the sampler fuses.
-            table: Signals and rewards of every slot; ``table.rewards`` has shape ``[N]``.
+            table: Signals and rewards of every slot; ``table.rewards`` has shape ``[N]``. So has
+                a signal, ``table.rows[: table.size, table.column[name]]``, NaN where it is unknown.
             index: Slots of the batch at hand, shape ``[B]``.
 
         Returns:
@@ -223,10 +232,9 @@ def checked_weights(
     fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor
 ) -> Tensor:
     """Return the checked weights of a fusion, in double precision, shape ``[K]``."""
-    weights = fusion.weights(names, table, index)
-    if weights.shape != (len(names),):
-        raise ValueError(f"fusion must give {len(names)} weights, got shape {[*weights.shape]}")
-    check_finite("weights of the fusion", weights)
+    name = "weights of the fusion"
+    weights = check_shape(name, fusion.weights(names, table, index), (len(names),))
+    check_finite(name, weights)
     return weights.to(table.rows.device, torch.double)
 
 

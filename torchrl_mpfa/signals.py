@@ -1,4 +1,4 @@
-"""Signals: what a priority is made of, and the table that keeps them for every slot of a buffer.
+"""Signals: what a priority is made of. ``samplers/table.py`` keeps them for every slot.
 
 A :class:`Signal` says where one number per transition comes from. Some are known when the
 transition is written (its reward); the others are learned, and come back with the batch after

@@ -41,7 +41,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         return {**super().__getstate__(), "_schema": None}
 
     def _checks(self, data: Any) -> bool:
-        # Not the attribute: the property has the parts made, where that was put off to their use.
+        # The property, not the attribute: with delayed_init the parts are made at their first use.
         sampler = self.sampler
         has_signals = isinstance(sampler, SignalSampler) or isinstance(
             self._storage, SignalTensorStorage
@@ -75,9 +75,12 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 f"got {[*tensordicts.shape]}: write a single step by add(...)"
             )
         tensordicts = self._without_padding(tensordicts)
-        # What is made here must be of use where the caller has no inference mode.
-        outside = torch.inference_mode(False), torch.no_grad()
-        with outside[0], outside[1], self._memory.transformed(tensordicts) as data:
+        # Outside of inference mode: a caller without it must be able to use what is stored.
+        with (
+            torch.inference_mode(False),
+            torch.no_grad(),
+            self._memory.transformed(tensordicts) as data,
+        ):
             return self._extend_checked(data, update_priority is not False)
 
     def _without_padding(self, data: TensorDictBase) -> TensorDictBase:
@@ -101,9 +104,9 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             shape = (0,) if self._storage.ndim == 1 else (0, self._storage.ndim)
             return torch.zeros(shape, dtype=torch.long)
         priority = data.get(self.priority_key, None)
-        # The writer adds the slots to it, and the caller's is left as it is.
-        taken = priority is not None and isinstance(self._sampler, SignalSampler)
-        data = data.exclude(self.priority_key) if taken else data.copy()
+        # A copy in both cases, as the writer adds the slots, which the caller's data shall not get.
+        is_apart = priority is not None and isinstance(self._sampler, SignalSampler)
+        data = data.exclude(self.priority_key) if is_apart else data.copy()
         if type(data) is not TensorDict:
             data = data.contiguous()
         if priority is not None:
@@ -119,18 +122,18 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _first_priorities(self, priority: Any, shape: torch.Size, prioritizes: bool) -> Any:
         """Return priorities of new transitions in the order of their slots, once checked."""
         name = f"{self.priority_key!r} of the transitions"
-        # Where nothing is sampled by it, a reward may be negative.
-        weighs = isinstance(self._sampler, PrioritizedSampler)
-        if not weighs and as_path(self.priority_key) == REWARD_KEY:
+        # A reward that is no priority may be negative.
+        by_priority = isinstance(self._sampler, PrioritizedSampler)
+        if not by_priority and as_path(self.priority_key) == REWARD_KEY:
             return priority
         real = isinstance(priority, Tensor) and not priority.is_complex()
-        if weighs and prioritizes and not (real and priority.numel() == shape.numel()):
+        if by_priority and prioritizes and not (real and priority.numel() == shape.numel()):
             form = f"{priority.dtype} of shape {[*priority.shape]}" if real else type(priority)
             raise ValueError(f"{name} must be one real number for each of {[*shape]}, got {form}")
         check_finite(name, priority)
         if prioritizes and hasattr(self._sampler, "check_priority"):
             self._sampler.check_priority(priority)
-        if not weighs:
+        if not by_priority:
             return priority
         # In the order of the slots, which is that of the data as they were written.
         priority = priority.reshape(shape)
@@ -143,17 +146,18 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         writer = self._writer
         in_a_ring = isinstance(writer, RoundRobinWriter)
         place = (writer._cursor, writer._write_count) if in_a_ring else None
-        # Another writer may keep some of them only.
+        # The sampler gets the rows that were checked. Another writer may keep some of them only.
         if in_a_ring and rows is not None and self._storage.ndim == 1:
-            self._sampler.read_next(rows)
+            self._sampler.take_rows(rows)
         try:
             with torch.no_grad():
+                # The writer calls mark_update of this buffer, which calls that of the sampler.
                 index: Tensor = writer.extend(data)
         except BaseException:
             if rows is not None:
-                self._sampler.read_next(None)
+                self._sampler.take_rows(None)
             if place is not None:
-                # It moves on before the storage has what it is to write.
+                # The writer advances before the storage has the data.
                 writer._cursor, writer._write_count = place
             raise
         self._clock[0] += 1

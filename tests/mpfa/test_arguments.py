@@ -121,9 +121,13 @@ ROWS = [
     (mpfa_sampler, {"alpha": -0.1}, "alpha must be greater or equal to 0 and finite, got -0.1"),
     (mpfa_sampler, {"entropy_refresh": -1.0}, f"entropy_refresh {NEGATIVE}, got -1.0"),
     (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
-    (mpfa_sampler, {"fusion": object()}, "fusion must be a torchrl_mpfa.Fusion, got object"),
-    (mpfa_sampler, {"adjustments": [3]}, "adjustments must be torchrl_mpfa.Adjustment, got int"),
-    (mpfa_sampler, {"adjustments": [max]}, "adjustments must be torchrl_mpfa.Adjustment, got bu"),
+    (mpfa_sampler, {"fusion": object()}, "fusion must be a torchrl_mpfa.Fusion, got <object"),
+    (mpfa_sampler, {"adjustments": [3]}, r"adjustments must be a list of .*Adjustment, got \[3\]"),
+    (
+        mpfa_sampler,
+        {"adjustments": PositiveBoost()},
+        "must be a list of .*Adjustment, got PositiveBoost",
+    ),
     (sampler, {"fusion": FixedFusion({"td_eror": 1.0})}, misspelt("'td_eror': did you mean 'td_e")),
     (
         sampler,

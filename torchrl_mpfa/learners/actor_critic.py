@@ -1,7 +1,8 @@
 r"""Actor and critics by DDPG, TD3 or SAC: one update from top to bottom (Eqs. 5, 4, 11, 13, 14).
 
 The three differ in four places: the number of critics, the noise on the action of the target, the
-delay of the actor, and the entropy of a stochastic actor.
+delay of the actor, and the entropy of a stochastic actor. ``update`` is that of
+:class:`~torchrl_mpfa.learners.optimized.OptimizedLearner`, which calls ``_differentiate`` here.
 """
 
 from __future__ import annotations
@@ -176,7 +177,10 @@ class ActorCritic(OptimizedLearner):
         check_networks(actor, critic)
         self.stochastic = isinstance(actor, ProbabilisticTensorDictSequential)
         if unknown := [name for name in signals if name not in KNOWN_SIGNALS]:
-            raise ValueError(f"signals must be among {KNOWN_SIGNALS}, got {unknown}")
+            raise ValueError(
+                f"signals must be among {KNOWN_SIGNALS}, got {unknown}: write a signal of "
+                "your own in the batch after update(...)"
+            )
         self.signals = tuple(signals)
         if loss_function not in DISTANCES:
             raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")
@@ -203,7 +207,7 @@ class ActorCritic(OptimizedLearner):
                 f"saturation_penalty is {saturation_penalty}, but actor writes no 'preactivation'"
             )
         smooths = self.policy_noise > 0
-        count, self.policy_delay, states = check_counts(
+        count, self.policy_delay, averaged = check_counts(
             critics=(2 if self.stochastic or smooths else 1) if critics is None else critics,
             policy_delay=(2 if smooths else 1) if policy_delay is None else policy_delay,
             target_average=target_average,
@@ -237,13 +241,13 @@ class ActorCritic(OptimizedLearner):
             networks["temperature"] = nn.ParameterDict({"log": self._log_alpha})
             groups += [{"params": [self._log_alpha], "lr": alpha_lr}] if alpha_lr > 0 else []
         targets.requires_grad_(False)
-        if states > 1:
-            networks["past"] = PastCritics(targets["critics"], states - 1).to(device)
+        if averaged > 1:
+            networks["past"] = PastCritics(targets["critics"], averaged - 1).to(device)
         super().__init__(networks, targets, groups, optimizer, tau)
         self.policy: TensorDictModule = actor
         self._actor_parameters = [*actor.parameters()]
-        self._stored = [key for key in critic.in_keys if key != "action"]
-        self._states = [*dict.fromkeys([*actor.in_keys, *self._stored])]
+        self._critic_keys = [key for key in critic.in_keys if key != "action"]
+        self._state_keys = [*dict.fromkeys([*actor.in_keys, *self._critic_keys])]
         if compile:
             self._program = CompiledUpdate(self, compile if isinstance(compile, dict) else {})
 
@@ -263,7 +267,7 @@ class ActorCritic(OptimizedLearner):
     def _learn_critics(self, batch: TensorDictBase, loss_function: str) -> dict[str, Tensor]:
         """Set the critics' gradients, write the signals, and return values for the log."""
         critics, slopes = self.networks["critics"], "action_gradient" in self.signals
-        stored = {key: batch[key].detach() for key in self._stored}
+        stored = {key: batch[key].detach() for key in self._critic_keys}
         action = batch["action"].detach().requires_grad_(slopes)
         # What is added to Q gets the gradient by Q.
         shift = action.new_zeros(len(critics), *action.shape[:-1]).requires_grad_(slopes)
@@ -314,23 +318,23 @@ class ActorCritic(OptimizedLearner):
     @torch.no_grad()
     def targets_of(self, batch: TensorDictBase) -> Tensor:
         """Compute the critics' targets (Eq. 5), shape ``[B]``, in units of scaled rewards."""
-        after = self._states_of(batch["next"])
+        next_states = self._states_of(batch["next"])
         if self.stochastic:
-            action, log_density, _ = self._sample(after)
-            values = self._target_values(after, action)
-            ahead = soft_value(values, log_density, alpha=self._log_alpha.exp())
+            action, log_density, _ = self._sample(next_states)
+            values = self._target_values(next_states, action)
+            next_value = soft_value(values, log_density, alpha=self._log_alpha.exp())
         else:
-            action = self.targets["actor"].outputs(after)["action"]
+            action = self.targets["actor"].outputs(next_states)["action"]
             if self.policy_noise > 0:
                 noise = smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
                 low, high = self.bounds
                 action = smoothed_action(action, noise, low=low, high=high)
-            ahead = least_value(self._target_values(after, action))
-        return target_of(batch, ahead, gamma=self.gamma, reward_scale=self.reward_scale)
+            next_value = least_value(self._target_values(next_states, action))
+        return target_of(batch, next_value, gamma=self.gamma, reward_scale=self.reward_scale)
 
     def values_of(self, batch: TensorDictBase) -> Tensor:
         """Compute each critic's Q of the actions in a batch, ``[C, B]``, in scaled rewards."""
-        stored = {key: batch[key] for key in self._stored}
+        stored = {key: batch[key] for key in self._critic_keys}
         critics = self.networks["critics"]
         return torch.stack([self._value(critic, stored, batch["action"]) for critic in critics])
 
@@ -355,7 +359,7 @@ class ActorCritic(OptimizedLearner):
         states, critics = self._states_of(batch), self.networks["critics"]
         log: dict[str, Tensor] = {}
         if self.stochastic:
-            action, log_density, before = self._sample(states)
+            action, log_density, preactivation = self._sample(states)
             values = torch.stack([self._value(critic, states, action) for critic in critics])
             temperature, density = self._log_alpha.detach().exp(), log_density.detach()
             losses = -soft_value(values, log_density, alpha=temperature)
@@ -370,16 +374,18 @@ class ActorCritic(OptimizedLearner):
             }
         else:
             chosen = self.networks["actor"].outputs(states)
-            action, before = chosen["action"], chosen.get("preactivation")
+            action, preactivation = chosen["action"], chosen.get("preactivation")
             losses = -self._value(critics[0], states, action)
+        # Only batches of ReF-ER have a trust.
         loss = self._mean(trusted_loss(losses, action, read_trust(batch)), batch)
-        if self.saturation_penalty > 0 and before is not None:
-            loss = loss + self.saturation_penalty * saturation(before, limit=self.saturation_limit)
+        if self.saturation_penalty > 0 and preactivation is not None:
+            excess = saturation(preactivation, limit=self.saturation_limit)
+            loss = loss + self.saturation_penalty * excess
         # The critics, through which the gradient flows, get none.
         if moved := [p for p in self._actor_parameters if p.requires_grad]:
             loss.backward(inputs=moved)
-        if before is not None:
-            log["preactivation"] = before.detach().abs()
+        if preactivation is not None:
+            log["preactivation"] = preactivation.detach().abs()
         return {"loss_actor": loss.detach(), **log}
 
     def _sample(self, states: Tensors) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -395,7 +401,7 @@ class ActorCritic(OptimizedLearner):
 
     def _states_of(self, source: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Read the states in which the actor is to act, without gradients."""
-        return {key: source[key].detach() for key in self._states}
+        return {key: source[key].detach() for key in self._state_keys}
 
     def _value(self, critic: Any, states: Tensors, action: Tensor) -> Tensor:
         """Compute Q of a critic, ``[B]``."""

@@ -163,7 +163,7 @@ class OptimizedLearner:
         own = getattr(self.update, "__func__", None) is not OptimizedLearner.update
         if self._program is None or own:
             return None
-        self._look()
+        self._follow_parameters()
         counts = range(self.updates + 1, self.updates + 1 + batches)
         turns: list[Trains] = ["both" if self._is_due(number) else "critic" for number in counts]
         size = len(rows) // batches
@@ -185,7 +185,7 @@ class OptimizedLearner:
         self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
     ) -> dict[str, Tensor]:
         """Step the optimizer, and the target networks with the actor; return the log."""
-        self._look()
+        self._follow_parameters()
         with fits_loss(batch):
             step = None if self._program is None else self._program(batch, trains, loss_function)
             if step is None:
@@ -208,25 +208,25 @@ class OptimizedLearner:
         if trains != "critic":
             self.move_targets()
 
-    def _look(self) -> None:
-        """Follow parameters that lie elsewhere now."""
+    def _follow_parameters(self) -> None:
+        """Flatten again if a parameter was given another tensor, as ``module.to(device)`` does."""
         if isinstance(self.optimizer, FlatAdam) and not self.optimizer.holds():
             self._flatten()
 
     @property
-    def _share(self) -> float:
+    def _rounded_tau(self) -> float:
         # As TorchRL computes it, to the last bit.
         return 1.0 - (1.0 - self.tau)
 
     @torch.no_grad()
     def move_targets(self) -> None:
         """Move the targets by tau towards the networks that they follow (Eqs. 6-7)."""
-        torch._foreach_lerp_(self._followers, self._online, self._share)
+        torch._foreach_lerp_(self._followers, self._online, self._rounded_tau)
 
     def record_targets(self, finite: Tensor) -> None:
         """Move the targets by operations that can be recorded, if the losses are finite."""
         for target, online in zip(self._followers, self._online, strict=True):
-            moved = torch.lerp(target, online, self._share)
+            moved = torch.lerp(target, online, self._rounded_tau)
             target.copy_(torch.where(finite, moved, target))
 
     def clear_gradients(self) -> None:

@@ -82,7 +82,10 @@ def write_signals(batch: TensorDictBase, loss: LossModule, *, order: float = 2.0
     key = loss.tensor_keys.priority
     error = batch.get(key, None)
     if error is None:
-        raise KeyError(f"{key!r} is missing in the batch: call loss(batch) first")
+        raise KeyError(
+            f"{key!r} is missing in the batch: call loss(batch) first. A part of a loss, such as "
+            "value_loss of TD3Loss, may return the error and not write it"
+        )
     error = error.detach().reshape(len(batch), -1).squeeze(1)
     # SAC with a network of state values writes the square, too.
     squared = isinstance(loss, _SQUARED) or (

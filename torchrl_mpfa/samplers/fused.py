@@ -20,6 +20,7 @@ from torchrl_mpfa.checks import (
     check_counts,
     check_finite,
     check_index,
+    check_shape,
     unknown,
 )
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
@@ -117,15 +118,16 @@ class SignalSampler(TreeSampler):
         fused = [signal.name for signal in self.signals]
         self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
         if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {type(fusion).__name__}")
+            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {fusion!r}")
         for name in self.fusion.signal_names:
             if name not in fused:
                 raise ValueError(unknown("signal of the fusion", name, fused))
+        listed = isinstance(adjustments, Sequence)
+        if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
+            raise TypeError(
+                f"adjustments must be a list of torchrl_mpfa.Adjustment, got {adjustments!r}"
+            )
         self.adjustments = tuple(adjustments)
-        for adjust in self.adjustments:
-            if not isinstance(adjust, Adjustment):
-                kind = type(adjust).__name__
-                raise TypeError(f"adjustments must be torchrl_mpfa.Adjustment, got {kind}")
         self.positive_above: Level = check(LEVEL, positive_above=positive_above)
         if self.positive_above == "mean" and self.fusion.uses_level:
             warnings.warn(
@@ -140,7 +142,7 @@ class SignalSampler(TreeSampler):
             raise ValueError(f"agents must be 'max', 'mean' or None, got {agents!r}")
         self.reward_key, self.agents = reward_key, agents
         self._warned: set[str] = set()
-        self._read: Tensor | None = None
+        self._next_rows: Tensor | None = None
         self._attached = False
         super().__init__(
             max_capacity,
@@ -221,9 +223,9 @@ class SignalSampler(TreeSampler):
             raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
         return rows
 
-    def read_next(self, rows: Tensor | None) -> None:
-        """Take rows of :meth:`check_new` for the slots that are marked next; None: read them."""
-        self._read = rows
+    def take_rows(self, rows: Tensor | None) -> None:
+        """Take rows of :meth:`check_new` for the next :meth:`mark_update`; None: it reads them."""
+        self._next_rows = rows
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Read the signals of new transitions in a storage, and give them the highest priority."""
@@ -235,8 +237,8 @@ class SignalSampler(TreeSampler):
             super().mark_update(slots)
 
     def _record(self, slots: Tensor, storage: Storage) -> None:
-        """Read the signals of new transitions."""
-        rows, self._read = self._read, None
+        """Keep the signals of new transitions, read from the storage unless they were handed in."""
+        rows, self._next_rows = self._next_rows, None
         if rows is None:
             rows = self.table.read(Steps(storage, slots), len(slots))
         self.table.write(slots, rows)
@@ -319,15 +321,16 @@ class SignalSampler(TreeSampler):
         table.check_fused(rows)
         if slots.numel() == 0:
             return stale
-        together = batches if stale == 0 and self._takes_batches() else 1
-        groups = [(slots, rows)] if together > 1 else by_batch(sizes, slots, rows)
+        # One group of all batches where that is allowed, else a group for each batch.
+        per_group = batches if stale == 0 and self._takes_batches() else 1
+        groups = [(slots, rows)] if per_group > 1 else by_batch(sizes, slots, rows)
         weighing, priorities = self._weighing, []
         for group_slots, group_rows in groups:
             if len(group_slots):
-                first_batch = group_slots[: len(group_slots) // together]
+                first_batch = group_slots[: len(group_slots) // per_group]
                 weighing = weigh(self, first_batch, weighing)  # Eqs. (15)-(20).
                 # Eqs. (21)-(24).
-                priorities.append(self._fused(table, group_rows, group_slots, weighing, together))
+                priorities.append(self._fused(table, group_rows, group_slots, weighing, per_group))
         priority = priorities[0] if len(priorities) == 1 else torch.cat(priorities)
         if (last := last_of_each(slots)) is not None:
             slots, rows, priority = slots[last], rows[last], priority[last]
@@ -351,23 +354,19 @@ class SignalSampler(TreeSampler):
     ) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
         shape = (batches, -1) if batches > 1 else slots.shape
-        priority = self.combined(rows, weighing).view(shape)
+        priority, slots = self.combined(rows, weighing).view(shape), slots.view(shape)
         facts = BatchFacts(
             reward=rows.select(1, table.reward_column).view(shape),
             replay_count=rows.select(1, table.count_column).view(shape),
-            index=(slots := slots.view(shape)),
+            index=slots,
             level=weighing.mean_reward if self.positive_above == "mean" else self.positive_above,
             written_at=rows.select(1, table.time_column).view(shape),
         )
         for place, adjust in enumerate(self.adjustments):
             if weighing.counted:
                 facts = replace(facts, counted=weighing.counted[place])
-            priority = adjust(priority, facts)
-            if priority.shape != slots.shape:
-                raise ValueError(
-                    f"adjusted priorities must have shape {[*slots.shape]}, got "
-                    f"{[*priority.shape]} from {type(adjust).__name__}"
-                )
+            name = f"priorities of {type(adjust).__name__}"
+            priority = check_shape(name, adjust(priority, facts), slots.shape)
         return priority.to(torch.double).reshape(-1)
 
     def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:

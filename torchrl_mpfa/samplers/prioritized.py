@@ -132,6 +132,7 @@ class TreeSampler(SavedTrees):
         )
         self._highest: float | None = None
         self._highest_slot: int | None = None
+        # True on a GPU while all priorities are surely positive, so that sampling need not wait.
         self._positive = False
 
     @property

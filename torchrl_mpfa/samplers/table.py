@@ -20,6 +20,7 @@ from torchrl_mpfa.checks import (
     check_counts,
     check_finite,
     check_index,
+    check_shape,
 )
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
@@ -134,7 +135,7 @@ class SignalTable:
             same = signal.key == self.reward_key
             value = reward if same else self._column(data, signal.key, signal.name, count)
             if value is not None:
-                rows[:, self.column[signal.name]] = _not_negative(signal, value)
+                rows[:, self.column[signal.name]] = _written_priority(signal, value)
         return rows
 
     def fill_learned(
@@ -147,19 +148,19 @@ class SignalTable:
         """Write learned signals of live rows in copies of them, batch by batch."""
         count = len(rows) if live is None else len(live)
         for signal in self.learned:
-            name, priority_of = signal.name, signal.priority
+            name = signal.name
             if name not in signals:
                 raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
             value = self._one_each(f"signal {name!r}", signals[name].detach(), count)
             value = value.to(rows.device)
             value = value if live is None else value[live]
             column = rows.select(1, self.column[name])
-            if priority_of is None:
+            if signal.priority is None:
                 column.copy_(value)
                 continue
             for one, into in by_batch(sizes, value, column):
                 if len(one):
-                    into.copy_(priority_of(one))
+                    into.copy_(_priority(signal, one))
 
     def check_fused(self, rows: Tensor) -> None:
         """Reject rows whose signals cannot be fused: missing, negative or not finite."""
@@ -315,8 +316,15 @@ def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, .
     return zip(*(column.split(list(sizes)) for column in columns), strict=True)
 
 
-def _not_negative(signal: Signal, value: Tensor) -> Tensor:
-    priority = (signal.priority or torch.abs)(value)
+def _priority(signal: Signal, value: Tensor) -> Tensor:
+    """Return the priorities of a signal by its function, by default the absolute values."""
+    name = f"priority of signal {signal.name!r}"
+    return check_shape(name, (signal.priority or torch.abs)(value), value.shape)
+
+
+def _written_priority(signal: Signal, value: Tensor) -> Tensor:
+    """Return the priorities of a signal known at the write, finite and not negative."""
+    priority = _priority(signal, value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):
         check_finite(f"signal {signal.name!r}", priority)

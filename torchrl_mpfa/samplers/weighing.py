@@ -53,21 +53,26 @@ def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weigh
     return _count(sampler, len(index), weighing)
 
 
-def _count(sampler: SignalSampler, learned: int, last: Weighing) -> Weighing:
-    """Have the adjustments count the buffer again if enough of it changed."""
+def _count(sampler: SignalSampler, batch_size: int, weighing: Weighing) -> Weighing:
+    """Have the adjustments count the buffer again, by present weights, if enough of it changed."""
     table = sampler.table
-    changed = table.writes - last.counted_writes + last.learned_since
+    changed = table.writes - weighing.counted_writes + weighing.learned_since
     few = 0 <= changed <= _COUNT_REFRESH * table.size and sampler.entropy_refresh > 0
-    if last.counted and few:
-        return replace(last, learned_since=last.learned_since + learned)
-    fused = sampler.combined(table.rows[: table.size], last)
+    if weighing.counted and few:
+        return replace(weighing, learned_since=weighing.learned_since + batch_size)
+    fused = sampler.combined(table.rows[: table.size], weighing)
     counted = [
         adjust.count(table, fused) if adjust.counts else None for adjust in sampler.adjustments
     ]
     for value in counted:
         if value is not None:
             check_finite("what an adjustment counted", value)
-    return replace(last, counted=tuple(counted), counted_writes=table.writes, learned_since=learned)
+    return replace(
+        weighing,
+        counted=tuple(counted),
+        counted_writes=table.writes,
+        learned_since=batch_size,
+    )
 
 
 def one_sided(sampler: SignalSampler) -> str | None:

@@ -87,7 +87,7 @@ def rows(make, argument, values, rule):
 def rows_of_all_learners(kind):
     make = partial(make_learner, kind)
     return [
-        (make, {"signals": ["novelty"]}, "signals must be among"),
+        (make, {"signals": ["novelty"]}, "signals must be among .*: write a signal of your own"),
         (make, {"gradient_order": 0.0}, "gradient_order must be positive, got 0.0"),
         (make, {"importance": "actor"}, "importance must be 'critic', .* or 'none', got 'actor'"),
         *rows(make, "reward_scale", (-1.0, 0.0, NAN), NOT_POSITIVE),

@@ -55,6 +55,21 @@ def test_td_error_of_a_pair_of_critics_is_the_larger_one_and_the_slope_the_first
     torch.testing.assert_close(batch["signals", "action_gradient"], slope)
 
 
+def test_td_error_that_a_part_of_a_loss_returns_is_written_by_hand():
+    actor, critic = make_networks()
+    loss = TD3Loss(actor, critic, loss_function="l2", num_qvalue_nets=2, **QUIET)
+    loss.make_value_estimator(gamma=0.99)
+    whole, parted = make_batch(16), make_batch(16)
+    loss(whole)
+    write_signals(whole, loss)
+    _, extra = loss.value_loss(parted)
+    with pytest.raises(KeyError, match="value_loss of TD3Loss, may return the error and not write"):
+        write_signals(parted, loss)
+    parted["td_error"] = extra["td_error"].detach().amax(0)
+    write_signals(parted, loss)
+    torch.testing.assert_close(parted["signals", "td_error"], whole["signals", "td_error"])
+
+
 def test_writing_signals_leaves_gradients_and_graph_as_they_were():
     loss = DDPGLoss(*make_networks(), loss_function="l2")
     loss.make_value_estimator(gamma=0.99)

@@ -14,6 +14,7 @@ from torchrl_mpfa import (
     Signal,
     SignalSampler,
 )
+from torchrl_mpfa.samplers.table import SignalTable
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
 SURPRISE = Signal("surprise", key="surprise", known_at="write", priority=torch.square)
@@ -128,7 +129,9 @@ def test_an_own_fusion_and_an_own_adjustment_do_their_work():
     assert priorities(buffer)[2:4] == pytest.approx([2.0, 1e-6])
 
 
-@pytest.mark.parametrize("weights", [torch.ones(2), torch.ones(4, 1), torch.ones(())])
+@pytest.mark.parametrize(
+    "weights", [torch.ones(2), torch.ones(4, 1), torch.ones(()), [1.0] * 4, None]
+)
 def test_an_own_fusion_of_the_wrong_shape_is_rejected(weights):
     class Wrong(Fusion):
         def weights(self, names, table, index):
@@ -136,8 +139,32 @@ def test_an_own_fusion_of_the_wrong_shape_is_rejected(weights):
 
     buffer = make_own_buffer(fusion=Wrong())
     buffer.extend(make_own_transitions(8))
-    with rejected(buffer, ValueError, "fusion must give 4 weights, got shape"):
+    with rejected(
+        buffer, ValueError, r"weights of the fusion must be a tensor of shape \[4\], got "
+    ):
         update(buffer, [2], td_error=[4.0], novelty=[2.0])
+
+
+@pytest.mark.parametrize("adjusted", [None, 1.0, torch.ones(())])
+def test_an_own_adjustment_that_gives_no_priority_each_is_rejected(adjusted):
+    class Wrong(Adjustment):
+        def __call__(self, priority, batch):
+            return adjusted
+
+    buffer = make_own_buffer(adjustments=[Wrong()])
+    buffer.extend(make_own_transitions(8))
+    with rejected(buffer, ValueError, r"priorities of Wrong must be a tensor of shape \[1\], got "):
+        update(buffer, [2], td_error=[4.0], novelty=[2.0])
+
+
+@pytest.mark.parametrize("known_at", ["write", "update"])
+@pytest.mark.parametrize("wrong", [torch.Tensor.tolist, torch.mean, lambda value: value[:1]])
+def test_a_function_of_a_signal_that_gives_no_priority_each_is_rejected(wrong, known_at):
+    table = SignalTable(8, [Signal("x", key="x", known_at=known_at, priority=wrong)])
+    with pytest.raises(ValueError, match=r"signal 'x' must be a tensor of shape \[4\], got "):
+        if known_at == "write":
+            table.read({"x": torch.ones(4)}, 4)
+        table.fill_learned(table.blank(4), {"x": torch.ones(4)}, None, [4])
 
 
 @pytest.mark.parametrize("wrong", [-1.0, torch.nan, torch.inf])
