@@ -56,7 +56,12 @@ def _parsed(texts: Sequence[str]) -> list[Override]:
         try:
             parsed.append(parser.parse_override(quoted(text)))
         except HydraException as error:
-            raise ValueError(f"{text!r} is not NAME=VALUE: {_one_line(error)}") from error
+            # Where the grammar's own error has no text, Hydra's has.
+            reason = str(error).splitlines()[0]
+            raise ValueError(
+                f"{text!r} is not NAME=VALUE: {reason}: put a value that has brackets or commas in "
+                f"""quotes, as in "NAME='VALUE'\""""
+            ) from error
     known = known_settings()
     overrides = [each for each in parsed if not each.key_or_group.startswith("hydra")]
     for override in overrides:

@@ -344,6 +344,7 @@ def test_setting_with_a_bad_value_is_rejected_by_name_in_one_sentence(
         ("seed=0,-1", "seed must be from 0 to 4294967295, got -1"),
         ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
         ("gamma", "'gamma' is not NAME=VALUE"),
+        ("run_dir=a[0]", r"is not NAME=VALUE: mismatched input .*: put a value .* in quotes"),
         ("tracking=wand", "unknown choice 'wand' of 'tracking': did you mean 'wandb'"),
         ("tracking=[csv,wand]", "unknown choice 'wand' of 'tracking': did you mean 'wandb'"),
         ("tracking=[off,csv]", r"tracking must be off, or one or several of .*got \[off,csv\]"),
