@@ -111,5 +111,7 @@ def test_a_plan_moves_with_the_localization_and_bounds_the_goal() -> None:
     assert pilot._plan is not None and pilot._plan.pose == (0.0, 0.0, 0.0)
     pilot.move_plan((0.3, 0.0, 0.0))
     assert pilot._plan.pose == (0.3, 0.0, 0.0)
+    with pytest.raises(ValueError, match="plan must be a World, got 'plan"):
+        pilot.begin((5.0, 0.0), plan="plan.yaml")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="plan must be None for a policy without a map"):
         a_pilot((0.0, 0.0)).begin((1.0, 0.0), plan=plan)

@@ -88,7 +88,18 @@ def test_a_robot_file_in_millimeters_is_rejected_at_its_line(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("key", "field"),
-    [("wheel_separation", "wheel_base"), ("robot_radius", "radius"), ("range_max", "lidar_range")],
+    [
+        ("wheel_separation", "wheel_base"),
+        ("robot_radius", "radius"),
+        ("range_max", "lidar_range"),
+        ("wheel_diameter", "wheel_radius"),
+        ("max_angular_speed", "turn_limit"),
+        ("max_vel_theta", "turn_limit"),
+        ("acc_lim_x", "wheel_acceleration"),
+        ("decel_lim_x", "deceleration"),
+        ("acc_lim_theta", "turn_acceleration"),
+        ("lidar_fov", "field_of_view"),
+    ],
 )
 def test_a_key_of_another_tool_is_answered_by_the_field(
     tmp_path: Path, key: str, field: str

@@ -78,7 +78,7 @@ def test_a_sector_between_two_rays_has_the_nearer_one() -> None:
 
 def test_sectors_out_of_view_need_a_given_range() -> None:
     scan = Scan(-math.pi / 3, math.pi / 180, np.full(121, 1.0))
-    with pytest.raises(ScanError, match="the scan does not reach the sector at 85 degrees"):
+    with pytest.raises(ScanError, match="sector at 85 degrees, its rays are from -60 to 60"):
         Sectors(card()).read(scan)
     found, _ = Sectors(card(), unseen=4.0).read(scan)
     assert found[[0, 1, 16, 17]].tolist() == [4.0] * 4 and found[3:15].tolist() == [1.0] * 12

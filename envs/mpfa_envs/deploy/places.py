@@ -27,9 +27,12 @@ def pair_of(name: str, place: tuple[float, float]) -> tuple[float, float]:
 
 def placed(world: World, pose: tuple[float, float, float]) -> Plan:
     """A plan at a pose."""
-    # Imported here because it needs Numba.
+    # Imported here because they need Numba.
     from mpfa_envs.deploy.map_path import Plan
+    from mpfa_envs.worlds.world import World
 
+    if not isinstance(world, World):
+        raise ValueError(f"plan must be a World, got {world!r}; load_world reads one from a file")
     x, y, heading = check_finite("plan_pose", pose, 3)
     return Plan(world, (*pair_of("plan_pose", (x, y)), heading))
 

@@ -350,7 +350,12 @@ class Sectors:
         degrees = round(math.degrees(middle))
         if not rays.cover(self._middles[index]):
             if self.unseen is None:
-                raise ScanError(f"the scan does not reach the sector at {degrees} degrees")
+                reach = 0.5 * rays.step * (rays.valid.size - 1)
+                right, left = (math.degrees(rays.middle + end) for end in (-reach, reach))
+                raise ScanError(
+                    f"the scan does not reach the sector at {degrees} degrees, "
+                    f"its rays are from {right:.0f} to {left:.0f} degrees"
+                )
             return min(self.unseen, self.card.max_range)
         within = off <= half + _EDGE
         own = rays.valid[within][self._index(rays.directions[within]) == index]

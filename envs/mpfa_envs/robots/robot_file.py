@@ -24,6 +24,13 @@ _ELSEWHERE: Final = {
     "min_velocity": "min_wheel_speed",
     "max_range": "lidar_range",
     "range_max": "lidar_range",
+    "max_angular_speed": "turn_limit",
+    "max_vel_theta": "turn_limit",
+    "acc_lim_x": "wheel_acceleration",
+    "decel_lim_x": "deceleration",
+    "acc_lim_theta": "turn_acceleration",
+    "wheel_diameter": "wheel_radius",
+    "lidar_fov": "field_of_view",
 }
 """Keys that other tools have for the fields."""
 
