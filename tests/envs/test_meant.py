@@ -37,6 +37,7 @@ from tests.envs.map_files import write_map
         ({"wheel_radius": 35}, "did you mean 0.035, "),
         ({"mass": 6300}, "did you mean 6.3, which is 6300 grams"),
         ({"lidar_range": 8000}, "lidar_range must be at most 300 m .* did you mean 8, "),
+        ({"turn_acceleration": 115}, "did you mean 2.007, which is 115 deg/s²"),
         ({"lidar_mount": (120, 0, 0)}, "lidar_mount must .* did you mean 0.12, "),
         ({"lidar_mount": (0.1, 0, -90)}, "at most 6.283 rad in size, .* did you mean -1.571, "),
         ({"field_of_view": 4.19}, "at least 7 deg .* did you mean 240.1, which is 4.19 radians"),
@@ -59,6 +60,8 @@ def test_a_measure_of_a_robot_in_another_unit_is_answered_by_the_one_meant(
     [
         ({"time_step": 100}, "time_step must be at most 10 s .* did you mean 0.1, "),
         ({"clearance": 70}, "did you mean 0.07, "),
+        ({"clearance": 3}, "clearance must be at most 1.5 m .* did you mean 0.03, "),
+        ({"goal_radius": 10}, "goal_radius must be at most 5 m .* did you mean 0.1, "),
         ({"goal_radius": 50}, "did you mean 0.05, |did you mean 0.5, "),
         ({"lidar": {"max_range": 8000}}, "max_range must .* did you mean 8, "),
         ({"lidar": {"field_of_view": 3.14, "sectors": 18}}, "did you mean 179.9, "),

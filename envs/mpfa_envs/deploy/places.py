@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from mpfa_envs.checks import MEANT
+from mpfa_envs.checks import MEANT, check_meant
 from mpfa_envs.deploy.card import check_finite
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def placed(world: World, pose: tuple[float, float, float]) -> Plan:
     if not isinstance(world, World):
         raise ValueError(f"plan must be a World, got {world!r}; load_world reads one from a file")
     x, y, heading = check_finite("plan_pose", pose, 3)
+    check_meant("plan_pose", heading, "yaw")
     return Plan(world, (*pair_of("plan_pose", (x, y)), heading))
 
 
