@@ -60,7 +60,6 @@ def test_a_measure_of_a_robot_in_another_unit_is_answered_by_the_one_meant(
     [
         ({"time_step": 100}, "time_step must be at most 10 s .* did you mean 0.1, "),
         ({"clearance": 70}, "did you mean 0.07, "),
-        ({"clearance": 3}, "clearance must be at most 1.5 m .* did you mean 0.03, "),
         ({"goal_radius": 10}, "goal_radius must be at most 5 m .* did you mean 0.1, "),
         ({"goal_radius": 50}, "did you mean 0.05, |did you mean 0.5, "),
         ({"lidar": {"max_range": 8000}}, "max_range must .* did you mean 8, "),
