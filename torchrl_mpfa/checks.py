@@ -54,6 +54,13 @@ def generator_on(device: torch.device, source: torch.Generator | None) -> torch.
     return source if usable else seeded_generator(source, device)
 
 
+def kind_of(value: Any) -> str:
+    """Return what a value is in words, as its text may have an address in memory."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    return "None" if value is None else type(value).__name__
+
+
 def check(rule: Rule, **values: Any) -> Any:
     """Return a value, or a tuple of several, as plain numbers; reject those against a rule by name.
 

@@ -46,6 +46,7 @@ from torchrl_mpfa.checks import (
     check_finite,
     check_shape,
     keep,
+    kind_of,
 )
 
 if TYPE_CHECKING:
@@ -357,7 +358,7 @@ class ScaledFusion(Fusion):
 
     def __post_init__(self) -> None:
         if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must be a Fusion, got {self.fusion!r}")
+            raise TypeError(f"fusion must be a Fusion, got {kind_of(self.fusion)}")
 
     @property
     def signal_names(self) -> tuple[str, ...]:

@@ -121,8 +121,10 @@ ROWS = [
     (mpfa_sampler, {"alpha": -0.1}, "alpha must be greater or equal to 0 and finite, got -0.1"),
     (mpfa_sampler, {"entropy_refresh": -1.0}, f"entropy_refresh {NEGATIVE}, got -1.0"),
     (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
-    (mpfa_sampler, {"fusion": object()}, "fusion must be a torchrl_mpfa.Fusion, got <object"),
-    (mpfa_sampler, {"adjustments": [3]}, r"adjustments must be a list of .*Adjustment, got \[3\]"),
+    (mpfa_sampler, {"fusion": object()}, "fusion must be a torchrl_mpfa.Fusion, got object$"),
+    (mpfa_sampler, {"fusion": EntropyFusion}, "Fusion, got the class EntropyFusion$"),
+    (mpfa_sampler, {"adjustments": [len]}, "list of .*Adjustment, got builtin_function_or_method$"),
+    (mpfa_sampler, {"adjustments": [3]}, "adjustments must be a list of .*Adjustment, got int$"),
     (
         mpfa_sampler,
         {"adjustments": PositiveBoost()},

@@ -21,6 +21,7 @@ from torchrl_mpfa.checks import (
     check_finite,
     check_index,
     check_shape,
+    kind_of,
     unknown,
 )
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
@@ -118,15 +119,14 @@ class SignalSampler(TreeSampler):
         fused = [signal.name for signal in self.signals]
         self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
         if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {fusion!r}")
+            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {kind_of(fusion)}")
         for name in self.fusion.signal_names:
             if name not in fused:
                 raise ValueError(unknown("signal of the fusion", name, fused))
         listed = isinstance(adjustments, Sequence)
         if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
-            raise TypeError(
-                f"adjustments must be a list of torchrl_mpfa.Adjustment, got {adjustments!r}"
-            )
+            kinds = ", ".join(map(kind_of, adjustments)) if listed else kind_of(adjustments)
+            raise TypeError(f"adjustments must be a list of torchrl_mpfa.Adjustment, got {kinds}")
         self.adjustments = tuple(adjustments)
         self.positive_above: Level = check(LEVEL, positive_above=positive_above)
         if self.positive_above == "mean" and self.fusion.uses_level:

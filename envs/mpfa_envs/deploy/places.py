@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mpfa_envs.checks import MEANT, check_meant
@@ -32,7 +33,9 @@ def placed(world: World, pose: tuple[float, float, float]) -> Plan:
     from mpfa_envs.worlds.world import World
 
     if not isinstance(world, World):
-        raise ValueError(f"plan must be a World, got {world!r}; load_world reads one from a file")
+        # The text of any other object may have an address in memory.
+        given = repr(world) if isinstance(world, str | Path) else type(world).__name__
+        raise ValueError(f"plan must be a World, got {given}; load_world reads one from a file")
     x, y, heading = check_finite("plan_pose", pose, 3)
     check_meant("plan_pose", heading, "yaw")
     return Plan(world, (*pair_of("plan_pose", (x, y)), heading))
