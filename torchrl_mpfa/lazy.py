@@ -30,6 +30,10 @@ GONE = {
     "hydra": "nothing: a Hydra file names each part as _target_",
     "SignalStorageMixin": "nothing: the sampler keeps the signals",
     "SignalTable": "torchrl_mpfa.samplers.SignalTable",
+    **dict.fromkeys(
+        ("check_adjustment", "check_fusion"),
+        "torchrl_mpfa.testing.check_sampler, which checks a sampler with both",
+    ),
 }
 """Names of 0.4 that went, with what replaces them: docs/from_0_4.md has all."""
 

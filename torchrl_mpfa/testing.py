@@ -1,35 +1,32 @@
-"""Checks of your own samplers, fusions and adjustments, for your own tests.
+"""One check of your own sampler, fusion or adjustment, for your own tests.
 
-Each function raises an :class:`AssertionError` with a sentence that says what is wrong, and returns
-nothing otherwise::
+It trains with the part in a buffer. It raises what the buffer raises, or an :class:`AssertionError`
+with a sentence that says what is wrong, and returns nothing otherwise::
 
-    from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
+    from torchrl_mpfa.testing import check_sampler
 
     def test_my_parts():
-        check_adjustment(MyAdjustment())
-        check_fusion(MyFusion(), ["reward", "td_error"])
         check_sampler(lambda: MySampler(64, 0.6, 0.4, 0.05))
+        check_sampler(lambda: SignalSampler(
+            64, 0.6, 0.4, 0.05, signals=["reward", "mine"], fusion=Mine(), adjustments=[MyBoost()]
+        ))
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.buffer import SignalReplayBuffer
-from torchrl_mpfa.fusion import Fusion
+from torchrl_mpfa.fusion import checked_weights
+from torchrl_mpfa.lazy import find
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.samplers.table import SignalTable
-from torchrl_mpfa.signals import Signal
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 _SAMPLES = 50_000
@@ -37,127 +34,13 @@ _SPREAD = 5.0
 """Standard deviations by which a frequency may miss its probability."""
 
 
-def check_adjustment(adjustment: Adjustment) -> None:
-    """Check that an adjustment keeps priorities in order.
-
-    Priorities of a batch are adjusted to as many, finite and not negative; what was handed in stays
-    as it is; the same comes out twice; and a batch of one works.
-
-    Args:
-        adjustment: The adjustment.
-
-    Raises:
-        AssertionError: If it does not.
-
-    Examples:
-        >>> from torchrl_mpfa import PositiveBoost
-        >>> check_adjustment(PositiveBoost(boost=2.0))
-        >>> class Wrong(PositiveBoost):
-        ...     def __call__(self, priority, batch):
-        ...         return -priority
-        >>> check_adjustment(Wrong())
-        Traceback (most recent call last):
-            ...
-        AssertionError: adjusted priorities must be finite and not negative, got -...
-    """
-    _require(isinstance(adjustment, Adjustment), "an adjustment must be a torchrl_mpfa.Adjustment")
-    generator = torch.Generator().manual_seed(0)
-    for count in (1, 2, 64):
-        priority = torch.rand(count, generator=generator, dtype=torch.double) * 5 + 0.01
-        reward = torch.randn(count, generator=generator, dtype=torch.double) * 3
-        replays = torch.randint(1, 50, (count,), generator=generator).double()
-        facts = BatchFacts(reward, replays, torch.arange(count), level=float(reward.mean()))
-        if adjustment.counts:
-            table = _table(("reward", "td_error"), scale=1.0, offset=0.0)
-            known = table.rows[: table.size, : len(table.names)].sum(1)
-            facts = replace(facts, counted=adjustment.count(table, known))
-        before = [each.clone() for each in (priority, reward, replays)]
-        found = adjustment(priority, facts)
-        _require(
-            isinstance(found, Tensor) and found.shape == priority.shape,
-            f"adjusted priorities must have shape [{count}], got {_shape(found)}",
-        )
-        _require_priorities("adjusted priorities", found)
-        unchanged = all(map(torch.equal, before, (priority, reward, replays)))
-        _require(unchanged, "an adjustment must not change what it is given")
-        _require(
-            torch.equal(found, adjustment(priority, facts)),
-            "an adjustment must give the same for the same batch",
-        )
-
-
-def check_fusion(
-    fusion: Fusion, signals: Sequence[Signal | str] = ("reward", "td_error", "action_gradient")
-) -> None:
-    """Check that a fusion gives one weight a signal, for rewards of any sign and scale.
-
-    Weights are finite, not negative, not all zero, and the same for the same buffer; the buffer
-    stays as it is; and a signal gets the same weight in any order of signals.
-
-    Args:
-        fusion: The fusion.
-        signals: The signals that it is meant for.
-
-    Raises:
-        AssertionError: If it does not.
-
-    Examples:
-        >>> from torchrl_mpfa import EntropyFusion
-        >>> check_fusion(EntropyFusion())
-    """
-    _require(isinstance(fusion, Fusion), "a fusion must be a torchrl_mpfa.Fusion")
-    for fraction in (0.0, 0.5, 1.0):
-        fusion.anneal(fraction)
-        for scale, offset in ((1.0, 0.0), (1.0, 9.0), (1.0, -9.0), (0.0, 0.0)):
-            table = _table(signals, scale=scale, offset=offset)
-            _check_weights(fusion, table, torch.arange(0, table.size, 3))
-
-
-def _check_weights(fusion: Fusion, table: SignalTable, index: Tensor) -> None:
-    names, before = list(table.names), table.rows.clone()
-    found = fusion.weights(names, table, index)
-    _require(
-        isinstance(found, Tensor) and found.shape == (len(names),),
-        f"a fusion must give one weight for each of {names}, got {_shape(found)}",
-    )
-    _require_priorities("weights", found)
-    _require(bool(found.sum() > 0), f"one of the weights must be positive, got {found.tolist()}")
-    _require(
-        torch.equal(table.rows.nan_to_num(), before.nan_to_num()),
-        "a fusion must not change the signals of the buffer",
-    )
-    turned = fusion.weights(names[::-1], table, index)
-    _require(
-        torch.allclose(turned.flip(0).double(), found.double()),
-        f"weights must follow the order of names: {found.tolist()} for {names}, "
-        f"{turned.tolist()} in reverse order",
-    )
-
-
-def _table(signals: Sequence[Signal | str], *, scale: float, offset: float) -> SignalTable:
-    """Return a table with forty of fifty slots filled, ten of them without learned signals."""
-    generator = torch.Generator().manual_seed(0)
-    table = SignalTable(50, signals)
-    reward = torch.randn(40, generator=generator, dtype=torch.double) * scale + offset
-    rows = table.rows[:40].clone()
-    rows[:, : len(table.names)] = torch.rand(
-        40, len(table.names), generator=generator, dtype=torch.double
-    )
-    for signal in table.learned:
-        rows[:10, table.column[signal.name]] = torch.nan
-    rows[:, table.reward_column] = reward
-    rows[:, table.count_column] = 1.0
-    table.write(torch.arange(40), rows)
-    table.size = 40
-    return table
-
-
 def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int = 16) -> None:
-    """Check a sampler in a buffer: frequencies, weights, saving and rejected input.
+    """Check a sampler in a buffer, with its fusion and adjustments.
 
     Slots are sampled in proportion to the leaves of its tree, weights are finite and in (0, 1],
-    batches after loading equal those without, to the last bit, and a rejected update or state
-    changes nothing.
+    batches and priorities after loading equal those without, to the last bit, and a rejected update
+    or state changes nothing. For rewards of any sign and scale the fusion gives one weight a
+    signal, in any order of signals. Training changes no reward.
 
     Args:
         make_sampler: Makes a new sampler, the same each time.
@@ -165,21 +48,45 @@ def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int 
 
     Raises:
         AssertionError: If one of them does not hold.
+        ValueError: If weights or priorities have a wrong shape, are negative or not finite.
 
     Examples:
-        >>> from torchrl_mpfa import MPFASampler
+        >>> from torchrl_mpfa import Adjustment, MPFASampler, SignalSampler
         >>> check_sampler(lambda: MPFASampler(32))
+        >>> class Wrong(Adjustment):
+        ...     def __call__(self, priority, batch):
+        ...         return -priority
+        >>> check_sampler(lambda: SignalSampler(32, 0.6, 0.4, 0.05, adjustments=[Wrong()]))
+        Traceback (most recent call last):
+            ...
+        ValueError: adjusted priorities must be finite and not negative, got -...
     """
-    buffer = _buffer(make_sampler(), batch_size, seed=0)
-    _train(buffer, 8)
+    for fraction, scale, offset in ((0.0, 1.0, 9.0), (0.5, 1.0, -9.0), (1.0, 0.0, 0.0)):
+        sampler = make_sampler()
+        sampler.anneal(fraction)
+        _check_weights(_trained(sampler, 1, scale=scale, offset=offset).sampler)
+    buffer = _trained(make_sampler(), batch_size)
+    _check_weights(buffer.sampler)
     _check_batch(buffer, batch_size)
-    _check_round_trip(buffer, _buffer(make_sampler(), batch_size, seed=1))
+    _check_round_trip(buffer, _trained(make_sampler(), batch_size, seed=1))
     _check_rejections(buffer)
     _check_frequencies(buffer)
 
 
-def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalReplayBuffer:
-    """Return a buffer that has wrapped, with random rewards and signals known at the write."""
+def __getattr__(name: str) -> Any:
+    """Say of a name that went what replaces it."""
+    return find(__name__, name, {})
+
+
+def _trained(
+    sampler: SignalSampler,
+    batch_size: int = 16,
+    *,
+    seed: int = 0,
+    scale: float = 1.0,
+    offset: float = 0.0,
+) -> SignalReplayBuffer:
+    """Return a buffer that has wrapped and was trained with, but for its newest transitions."""
     generator = torch.Generator().manual_seed(seed)
     capacity = sampler.max_size
     buffer = SignalReplayBuffer(
@@ -189,147 +96,128 @@ def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalRepl
         generator=generator,
     )
     for count in (capacity, max(capacity // 3, 1)):
-        data = TensorDict({"next": {"reward": torch.randn(count, 1, generator=generator)}}, [count])
+        reward = torch.randn(count, 1, generator=generator) * scale + offset
+        data = TensorDict({"next": {"reward": reward}}, [count])
         for signal in sampler.signals:
             if signal.known_at == "write" and data.get(signal.key, None) is None:
                 data.set(signal.key, torch.rand(count, generator=generator))
         buffer.extend(data)
+        rewards = buffer.rewards().clone()
+        _train(buffer, 8 if count == capacity else 2)
+        _require(torch.equal(rewards, buffer.rewards()), "training must not change the rewards")
     return buffer
 
 
 def _train(buffer: SignalReplayBuffer, rounds: int, *, seed: int = 2) -> Tensor:
     """Sample and update for some rounds; return the sampled slots."""
     generator = torch.Generator().manual_seed(seed)
-    sampled = []
+    slots = []
     for _ in range(rounds):
         batch = buffer.sample()
-        sampled.append(batch["index"].clone())
-        buffer.update_tensordict_priority(_with_signals(buffer, batch, generator))
-    return torch.cat(sampled)
+        slots.append(batch["index"].clone())
+        for signal in buffer.sampler.signals:
+            if signal.known_at == "update":
+                batch.set(signal.key, torch.rand(len(batch), generator=generator) * 3 + 0.01)
+        buffer.update_tensordict_priority(batch)
+    return torch.cat(slots)
 
 
-def _with_signals(buffer: SignalReplayBuffer, batch: Any, generator: torch.Generator) -> Any:
-    for signal in buffer.sampler.signals:
-        if signal.known_at == "update":
-            batch.set(signal.key, torch.rand(len(batch), generator=generator) * 3 + 0.01)
-    return batch
+def _check_weights(sampler: SignalSampler) -> None:
+    table = sampler.table
+    names, index = [*table.names[table.fused]], torch.arange(0, table.size, 3)
+    weights, turned = (
+        checked_weights(sampler.fusion, order, table, index) for order in (names, names[::-1])
+    )
+    _require(bool(weights.sum() > 0), f"one weight must be positive, got {weights.tolist()}")
+    _require(
+        torch.allclose(turned.flip(0), weights),
+        f"weights must follow the order of names: {weights.tolist()} for {names}, "
+        f"{turned.tolist()} in reverse order",
+    )
 
 
 def _check_batch(buffer: SignalReplayBuffer, batch_size: int) -> None:
     batch = buffer.sample()
     index, weight = batch["index"], batch["priority_weight"]
     _require(
-        index.shape == (batch_size,) and index.dtype is torch.long,
-        f"a batch must have {batch_size} integer slots, got {index.dtype} {_shape(index)}",
+        index.shape == weight.shape == (batch_size,) and index.dtype is torch.long,
+        f"a batch must have {batch_size} integer slots and weights, got {index.dtype} of shape "
+        f"{[*index.shape]} and {[*weight.shape]}",
     )
     _require(
         bool(((index >= 0) & (index < len(buffer))).all()),
         f"slots must be in [0, {len(buffer)}), got {index.tolist()}",
     )
     _require(
-        weight.shape == (batch_size,),
-        f"priority_weight must have shape [{batch_size}], got {_shape(weight)}",
-    )
-    _require(
         bool(((weight > 0) & (weight <= 1 + 1e-6)).all()),
         f"priority_weight must be in (0, 1], got {weight.tolist()}",
     )
-    priorities = buffer.sampler.priorities(index)
-    _require_priorities("priorities of written slots", priorities)
 
 
 def _check_round_trip(first: SignalReplayBuffer, second: SignalReplayBuffer) -> None:
     second.load_state_dict(copy.deepcopy(first.state_dict()))
+    states = [buffer.sampler.state_dict() for buffer in (first, second)]
+    _require(_same(*states), "a sampler that loaded a state must have that state")
+    slots = [_train(buffer, 6, seed=4) for buffer in (first, second)]
+    states = [buffer.sampler.state_dict() for buffer in (first, second)]
     _require(
-        _same(first.sampler.state_dict(), second.sampler.state_dict()),
-        "a sampler that loaded a state must have that state",
+        torch.equal(*slots) and _same(*states),
+        "a sampler that loaded a state must sample and update as the one that saved it",
     )
-    third = copy.deepcopy(first.state_dict())
-    sampled = [_train(buffer, 6, seed=4) for buffer in (first, second)]
-    _require(
-        torch.equal(*sampled), "a sampler that loaded a state must sample as the one that saved it"
-    )
-    first.load_state_dict(third)
 
 
 def _check_rejections(buffer: SignalReplayBuffer) -> None:
     sampler, before = buffer.sampler, copy.deepcopy(buffer.state_dict())
-    slots = torch.tensor([0, 1])
-    calls: list[tuple[str, Callable[[], object]]] = []
-    for wrong in (math.nan, math.inf, -1.0):
-        priority = torch.tensor([1.0, wrong])
-        update = partial(sampler.update_priority, slots, priority)
-        calls.append((f"a priority of {wrong}", update))
-    outside = torch.tensor([0, sampler.max_size])
-    calls.append(("a slot outside", lambda: sampler.update_priority(outside, torch.ones(2))))
-    mask = torch.tensor([True, False])
-    calls.append(("a mask as index", lambda: sampler.update_priority(mask, torch.ones(2))))
-    for name in sampler.state_dict():
-        if name == "_schema_version":
-            continue
-        state = {key: value for key, value in sampler.state_dict().items() if key != name}
-        calls.append((f"a state without {name}", partial(sampler.load_state_dict, state)))
-    for what, call in calls:
+    slots, ones, state = torch.tensor([0, 1]), torch.ones(2), sampler.state_dict()
+    wrong: list[tuple[str, Callable[..., object], tuple[Any, ...]]] = [
+        ("a slot outside", sampler.update_priority, (slots * sampler.max_size, ones)),
+        ("a mask as index", sampler.update_priority, (slots == 0, ones)),
+    ]
+    for number in (math.nan, math.inf, -1.0):
+        priority = torch.tensor([1.0, number])
+        wrong.append((f"a priority of {number}", sampler.update_priority, (slots, priority)))
+    for name in state.keys() - {"_schema_version"}:
+        rest = {key: value for key, value in state.items() if key != name}
+        wrong.append((f"a state without {name}", sampler.load_state_dict, (rest,)))
+    for what, call, arguments in wrong:
         try:
-            call()
+            call(*arguments)
         except (ValueError, IndexError, TypeError, KeyError):
-            pass
+            unchanged = _same(before, buffer.state_dict())
+            _require(unchanged, f"{what} was rejected, but changed the sampler")
         else:
-            _require(False, f"{what} must be rejected")
-        _require(
-            _same(before, buffer.state_dict()), f"{what} was rejected, but changed the sampler"
-        )
+            raise AssertionError(f"{what} must be rejected")
 
 
 def _check_frequencies(buffer: SignalReplayBuffer) -> None:
-    slots = torch.arange(len(buffer))
-    leaf = torch.as_tensor(buffer.sampler._sum_tree[slots]).reshape(-1).double()
-    expected = leaf / leaf.sum()
     # Not more at once than a sampler with a cap can sample by priority.
-    at_once = len(buffer)
-    rounds = math.ceil(_SAMPLES / at_once)
-    sampled = torch.cat(
-        [buffer.sampler._sampled(buffer.storage, at_once)[0] for _ in range(rounds)]
-    )
-    found = torch.bincount(sampled, minlength=len(buffer)).double() / len(sampled)
-    sigma = (expected * (1 - expected) / len(sampled)).sqrt()
-    off = (found - expected).abs() - _SPREAD * sigma
-    worst = int(off.argmax())
+    size = len(buffer)
+    leaf = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(size)]).reshape(-1).double()
+    expected = leaf / leaf.sum()
+    rounds = range(math.ceil(_SAMPLES / size))
+    slots = torch.cat([buffer.sampler._sampled(buffer.storage, size)[0] for _ in rounds])
+    frequency = torch.bincount(slots, minlength=size).double() / len(slots)
+    sigma = (expected * (1 - expected) / len(slots)).sqrt()
+    excess = (frequency - expected).abs() - _SPREAD * sigma
+    worst = int(excess.argmax())
     _require(
-        bool(off[worst] < 1e-9),
+        bool(excess[worst] < 1e-9),
         f"slot {worst} must be sampled with probability {expected[worst]:.4f}, as its leaf has it, "
-        f"and was with {found[worst]:.4f}",
+        f"and was with {frequency[worst]:.4f}",
     )
 
 
 def _same(first: Any, second: Any) -> bool:
     """Return True if two states are equal to the last bit, with NaN equal to NaN."""
     if isinstance(first, Tensor):
-        fits = isinstance(second, Tensor) and (first.shape, first.dtype) == (
-            second.shape,
-            second.dtype,
-        )
-        return fits and bool(((first == second) | ((first != first) & (second != second))).all())
+        alike = (first.shape, first.dtype) == (second.shape, second.dtype)
+        return alike and bool(((first == second) | ((first != first) & (second != second))).all())
     if is_tensor_collection(first) or isinstance(first, dict):
-        return set(first.keys()) == set(second.keys()) and all(
-            _same(first[key], second[key])
-            for key in first.keys()  # noqa: SIM118
-        )
+        keys = [*first.keys()]
+        return {*keys} == {*second.keys()} and all(_same(first[key], second[key]) for key in keys)
     if isinstance(first, list | tuple):
         return len(first) == len(second) and all(map(_same, first, second))
     return bool(first == second)
-
-
-def _require_priorities(what: str, values: Tensor) -> None:
-    wrong = values[~((values >= 0) & (values < math.inf))]
-    _require(
-        len(wrong) == 0,
-        f"{what} must be finite and not negative, got {wrong[0].item() if len(wrong) else None}",
-    )
-
-
-def _shape(value: Any) -> str:
-    return f"shape {[*value.shape]}" if isinstance(value, Tensor) else type(value).__name__
 
 
 def _require(holds: bool, text: str) -> None:

@@ -16,6 +16,8 @@ PACKAGES = {
     "MultiTensorSoftUpdate": [LEARNERS],
     "ReplayHistory": ["torchrl_mpfa"],
     "TabularQLearner": ["torchrl_mpfa"],
+    "check_adjustment": ["torchrl_mpfa.testing"],
+    "check_fusion": ["torchrl_mpfa.testing"],
 }
 """Packages that a name was in, if that was not the first."""
 

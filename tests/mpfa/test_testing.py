@@ -1,4 +1,4 @@
-"""The checks for parts of one's own: all of ours pass, and broken ones are caught."""
+"""The check of parts of one's own: all of ours pass, and broken ones are caught."""
 
 import pytest
 import torch
@@ -25,7 +25,14 @@ from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
-from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
+from torchrl_mpfa.testing import check_sampler
+
+
+def with_parts(signals=("reward", "td_error"), fusion=None, adjustment=None):
+    adjustments = () if adjustment is None else [adjustment]
+    return SignalSampler(
+        40, 0.6, 0.4, 0.05, signals=signals, fusion=fusion, adjustments=adjustments
+    )
 
 
 @pytest.mark.parametrize(
@@ -33,6 +40,7 @@ from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
     [
         PositiveBoost(),
         PositiveBoost(bound="cap"),
+        PositiveBoost(target_share=0.5),
         PositiveDecay(),
         PositiveDecay(position="rank"),
         PositiveDecay(position="count"),
@@ -41,7 +49,7 @@ from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
     ],
 )
 def test_our_adjustments_pass(adjustment):
-    check_adjustment(adjustment)
+    check_sampler(lambda: with_parts(adjustment=adjustment))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +65,7 @@ def test_our_adjustments_pass(adjustment):
     ],
 )
 def test_our_fusions_pass(fusion, signals):
-    check_fusion(fusion, signals)
+    check_sampler(lambda: with_parts(signals, fusion))
 
 
 @pytest.mark.parametrize(
@@ -77,15 +85,20 @@ def test_our_samplers_pass(make):
     check_sampler(make)
 
 
+def change_rewards(priority, batch):
+    batch.reward.mul_(2.0)
+    return priority
+
+
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        (lambda priority, batch: priority[:1], r"must have shape \[2\], got shape \[1\]"),
-        (lambda priority, batch: 3.0, r"must have shape \[1\], got float"),
+        (lambda priority, batch: priority[:0], r"must be a tensor of shape \[1\], got shape \[0\]"),
+        (lambda priority, batch: 3.0, r"must be a tensor of shape \[1\], got float"),
         (lambda priority, batch: -priority, "must be finite and not negative, got -"),
         (lambda priority, batch: priority / 0.0, "must be finite and not negative, got inf"),
-        (lambda priority, batch: priority.mul_(2.0), "must not change what it is given"),
-        (lambda priority, batch: priority * torch.rand(()), "the same for the same batch"),
+        (change_rewards, "must not change the rewards"),
+        (lambda priority, batch: priority * torch.rand(()), "update as the one that saved it"),
     ],
 )
 def test_broken_adjustments_are_caught(broken, message):
@@ -93,10 +106,10 @@ def test_broken_adjustments_are_caught(broken, message):
         def __call__(self, priority, batch):
             return broken(priority, batch)
 
-    with pytest.raises(AssertionError, match=message):
-        check_adjustment(Broken())
-    with pytest.raises(AssertionError, match=r"must be a torchrl_mpfa\.Adjustment"):
-        check_adjustment(broken)
+    with pytest.raises((AssertionError, ValueError), match=message):
+        check_sampler(lambda: with_parts(adjustment=Broken()))
+    with pytest.raises(TypeError, match=r"torchrl_mpfa\.Adjustment"):
+        check_sampler(lambda: with_parts(adjustment=broken))
 
 
 class Broken(Fusion):
@@ -112,23 +125,20 @@ def scribble(names, table, index):
 @pytest.mark.parametrize(
     ("weigh", "message"),
     [
-        (lambda names, table, index: torch.ones(1), "one weight for each of"),
-        (lambda names, table, index: [1.0] * len(names), "one weight for each of .*got list"),
-        (
-            lambda names, table, index: torch.zeros(len(names)),
-            "one of the weights must be positive",
-        ),
-        (lambda names, table, index: -torch.ones(len(names)), "weights must be finite and not neg"),
+        (lambda names, table, index: torch.ones(1), r"weights of the fusion must be .*\[3\]"),
+        (lambda names, table, index: [1.0] * len(names), "weights of the fusion .*got list"),
+        (lambda names, table, index: torch.zeros(len(names)), "one weight must be positive"),
+        (lambda names, table, index: -torch.ones(len(names)), "must be finite and not negative"),
         (lambda names, table, index: table.rewards.mean().log().expand(3), "got nan|got -inf"),
         (lambda names, table, index: torch.arange(1.0, 4.0), "must follow the order of names"),
-        (scribble, "must not change the signals of the buffer"),
+        (scribble, "must not change the rewards"),
     ],
 )
 def test_broken_fusions_are_caught(weigh, message):
-    with pytest.raises(AssertionError, match=message):
-        check_fusion(Broken(weigh))
-    with pytest.raises(AssertionError, match=r"must be a torchrl_mpfa\.Fusion"):
-        check_fusion(object())
+    with pytest.raises((AssertionError, ValueError), match=message):
+        check_sampler(lambda: with_parts(["reward", "td_error", "novelty"], Broken(weigh)))
+    with pytest.raises(TypeError, match=r"torchrl_mpfa\.Fusion"):
+        check_sampler(lambda: with_parts(fusion=object()))
 
 
 class SamplesSlotZero(SignalSampler):
@@ -189,7 +199,7 @@ class LoadsAnything(SignalSampler):
         (SamplesSlotZero, "slot 0 must be sampled with probability"),
         (GivesNegativeWeights, r"priority_weight must be in \(0, 1\]"),
         (SamplesTooFew, "a batch must have 16 integer slots"),
-        (KeepsACountToItself, "must sample as the one that saved it"),
+        (KeepsACountToItself, "must sample and update as the one that saved it"),
         (ForgetsAlpha, "must have that state"),
         (TakesEverything, "a priority of nan must be rejected"),
         (ChangesFirst, "was rejected, but changed the sampler"),
