@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
 from tests.mpfa.learning import differentiate
@@ -15,7 +16,7 @@ from torchrl_mpfa import (
     make_critic,
     make_stochastic_actor,
 )
-from torchrl_mpfa.losses.functional import Trust, trusted_loss
+from torchrl_mpfa.losses import trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
 
@@ -196,7 +197,9 @@ def test_loss_of_the_actor_is_that_of_the_formula():
     loss, weight, held = (torch.rand(5, generator=seeded(n)) for n in range(3))
     action, mean = (random_actions(n, 5).float() for n in (3, 4))
     sigma = torch.rand(5, 1, generator=seeded(5)) + 0.2
-    found = trusted_loss(loss, action, Trust(weight, held, mean, sigma))
+    entries = {"behavior_mean": mean, "behavior_sigma": sigma}
+    entries |= {"policy_weight": weight, "behavior_weight": held}
+    found = trusted_loss(loss, action, TensorDict(entries, [5]))
     for row in range(5):
         divergence = sum(
             (float(a) - float(m)) ** 2 / (2 * float(sigma[row]) ** 2)

@@ -14,7 +14,7 @@ from tests.mpfa.transitions import seeded
 from torchrl_mpfa import ActorCritic, make_actor, make_critic
 from torchrl_mpfa.learners import actor_critic
 from torchrl_mpfa.learners.networks import QUANTILES
-from torchrl_mpfa.losses.functional import LEAST_NOISE, quantile_loss
+from torchrl_mpfa.losses import LEAST_NOISE, quantile_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
 

@@ -16,7 +16,7 @@ from torchrl.trainers import (
     Trainer,
 )
 
-from torchrl_mpfa.losses.torchrl import SUPPORTED, write_signals
+from torchrl_mpfa.losses import SUPPORTED, write_signals
 from torchrl_mpfa.signals import TD_ERROR
 
 

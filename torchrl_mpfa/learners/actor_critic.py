@@ -30,15 +30,12 @@ from torchrl_mpfa.learners.networks import (
     with_quantiles,
 )
 from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
-from torchrl_mpfa.losses.functional import (
+from torchrl_mpfa.losses import (
     DISTANCES,
     LEAST_NOISE,
-    critic_loss,
-    least_value,
+    distance,
     quantile_loss,
-    read_trust,
     saturation,
-    smoothed_action,
     smoothing_noise,
     soft_value,
     target_of,
@@ -279,7 +276,9 @@ class ActorCritic(OptimizedLearner):
         target = self.targets_of(batch)  # Eq. (5)
 
         scale = self.reward_scale
-        losses = critic_loss(value, target, loss_function, unit=scale, pal_alpha=self.pal_alpha)
+        losses = distance(
+            value, target.expand_as(value), loss_function, unit=scale, pal_alpha=self.pal_alpha
+        ).sum(0)  # Eq. (4), of all critics.
         error = (target - value).detach()
         signals = {"td_error": td_error_priority(error).amax(0) / scale}  # Eq. (13)
         if "information_gain" in self.signals:
@@ -289,7 +288,7 @@ class ActorCritic(OptimizedLearner):
             signals["information_gain"] = information_gain_priority(
                 error, quantiles.detach(), least_noise=LEAST_NOISE * scale
             )
-        loss = self._mean(losses, batch, weighted=self.importance != "none")  # Eqs. (4), (11)
+        loss = self._mean(losses, batch, weighted=self.importance != "none")  # Eq. (11)
         if slopes:
             # Moves no weight: without error a transition's Q would have no gradient to divide by.
             least = max(_LEAST_SLOPE, torch.finfo(value.dtype).tiny)
@@ -328,8 +327,8 @@ class ActorCritic(OptimizedLearner):
             if self.policy_noise > 0:
                 noise = smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
                 low, high = self.bounds
-                action = smoothed_action(action, noise, low=low, high=high)
-            next_value = least_value(self._target_values(next_states, action))
+                action = torch.clamp(action + noise, low, high)
+            next_value = self._target_values(next_states, action).amin(0)
         return target_of(batch, next_value, gamma=self.gamma, reward_scale=self.reward_scale)
 
     def values_of(self, batch: TensorDictBase) -> Tensor:
@@ -376,8 +375,7 @@ class ActorCritic(OptimizedLearner):
             chosen = self.networks["actor"].outputs(states)
             action, preactivation = chosen["action"], chosen.get("preactivation")
             losses = -self._value(critics[0], states, action)
-        # Only batches of ReF-ER have a trust.
-        loss = self._mean(trusted_loss(losses, action, read_trust(batch)), batch)
+        loss = self._mean(trusted_loss(losses, action, batch), batch)
         if self.saturation_penalty > 0 and preactivation is not None:
             excess = saturation(preactivation, limit=self.saturation_limit)
             loss = loss + self.saturation_penalty * excess

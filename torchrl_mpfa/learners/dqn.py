@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.learners.checks import check_alike, check_losses
 from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
-from torchrl_mpfa.losses.functional import distance, read_choices, target_of
+from torchrl_mpfa.losses import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
 from torchrl_mpfa.priorities import td_error_priority

@@ -2,7 +2,7 @@ r"""LAP: priorities that do not fall below the bend of the Huber loss, and no im
 
 Fujimoto et al. (2020), "An equivalence between loss functions and non-uniform sampling in
 experience replay", https://arxiv.org/abs/2007.06049. Its uniform twin PAL is a loss:
-:func:`~torchrl_mpfa.losses.functional.pal_distance`.
+:func:`~torchrl_mpfa.losses.pal_distance`.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, POSITIVE, SHARE, check
-from torchrl_mpfa.losses.functional import (
+from torchrl_mpfa.losses import (
     BEHAVIOR_MEAN,
     BEHAVIOR_SIGMA,
     BEHAVIOR_WEIGHT,

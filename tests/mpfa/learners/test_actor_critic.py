@@ -27,7 +27,7 @@ from tests.mpfa.learning import (
 )
 from tests.mpfa.transitions import same, snapshot
 from torchrl_mpfa import ActorCritic
-from torchrl_mpfa.losses.functional import distance, pal_distance
+from torchrl_mpfa.losses import distance, pal_distance
 
 # TorchRL warns at every loss of its own whose target networks nothing moves.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")

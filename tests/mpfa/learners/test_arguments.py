@@ -20,7 +20,7 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.learners.optimized import make_optimizer
-from torchrl_mpfa.losses.functional import distance
+from torchrl_mpfa.losses import distance
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.her import HindsightGoals

@@ -7,7 +7,7 @@ import torch
 
 from tests.mpfa import learning
 from tests.mpfa.learning import GAMMA, KINDS, make_batch
-from torchrl_mpfa.losses.functional import smoothing_noise
+from torchrl_mpfa.losses import smoothing_noise
 
 DETERMINISTIC = ["ddpg", "td3"]
 

@@ -15,7 +15,7 @@ from tests.mpfa.learning import (
     make_torchrls,
 )
 from tests.mpfa.transitions import same
-from torchrl_mpfa.losses.functional import smoothing_noise
+from torchrl_mpfa.losses import smoothing_noise
 
 # TorchRL warns at every loss of its own whose target networks nothing moves.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")

@@ -27,7 +27,7 @@ from torchrl.objectives import LossModule
 
 import torchrl_mpfa as mpfa
 
-PAGE = Path(__file__).resolve().parents[3] / "docs/howto/torchrl_script.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/howto/torchrl_script.md"
 ROWS, OBSERVED, ACTIONS = 8, 4, 2
 SPEC, CHOICES = Bounded(-1.0, 1.0, (ACTIONS,)), OneHot(ACTIONS)
 LARGE = 1000.0

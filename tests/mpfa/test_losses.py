@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa.losses.functional import distance, pal_distance, smoothing_noise
+from torchrl_mpfa.losses import distance, pal_distance, smoothing_noise
 
 ALPHA = 0.4
 

@@ -1,4 +1,6 @@
-r"""The mathematics of the losses as pure functions, of the eager and of the compiled update alike.
+r"""The mathematics of losses as pure functions, and the signals of TorchRL's own losses.
+
+The functions are those of the eager and of the compiled update alike.
 
 In the shapes ``B`` is a batch (of one or more dimensions), ``C`` the number of critics and ``A``
 the size of an action.
@@ -6,14 +8,19 @@ the size of an action.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl import objectives
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_mpfa.checks import as_mask
+from torchrl_mpfa.lazy import find
+from torchrl_mpfa.priorities import action_gradient_priority
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+from torchrl_mpfa.storages.schema import as_path
 
 PAL = "pal"
 DISTANCES = ("l1", "l2", "smooth_l1", PAL)
@@ -26,7 +33,6 @@ POLICY_WEIGHT = "policy_weight"
 BEHAVIOR_WEIGHT = "behavior_weight"
 BEHAVIOR_MEAN = "behavior_mean"
 BEHAVIOR_SIGMA = "behavior_sigma"
-BEHAVIOR = (BEHAVIOR_MEAN, BEHAVIOR_SIGMA)
 
 
 def bootstrap_target(
@@ -84,32 +90,9 @@ def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor
     return torch.randn_like(action).mul_(deviation).clamp_(-limit, limit)
 
 
-def smoothed_action(action: Tensor, noise: Tensor, *, low: Tensor, high: Tensor) -> Tensor:
-    """Add noise to TD3's target action, within the bounds, shape ``[B, A]``."""
-    return torch.clamp(action + noise, low, high)
-
-
-def least_value(values: Tensor) -> Tensor:
-    r"""Value in TD3's clipped double-Q target, :math:`\min_k Q_k`, from ``[C, B]`` to ``[B]``."""
-    return values.amin(0)
-
-
 def soft_value(values: Tensor, log_density: Tensor, *, alpha: float | Tensor) -> Tensor:
     r"""Value in SAC's target and actor's loss, :math:`\min_k Q_k(s, a) - \alpha \ln \pi(a | s)`."""
-    return least_value(values) - alpha * log_density
-
-
-def critic_loss(
-    value: Tensor,
-    target: Tensor,
-    loss_function: str,
-    *,
-    unit: float,
-    pal_alpha: float,
-) -> Tensor:
-    """Compute each transition's loss (Eq. 4), summed over critics, from ``[C, B]`` to ``[B]``."""
-    target = target.expand_as(value)
-    return distance(value, target, loss_function, unit=unit, pal_alpha=pal_alpha).sum(0)
+    return values.amin(0) - alpha * log_density
 
 
 def distance(
@@ -134,8 +117,8 @@ def distance(
         error = (target - value) / unit
         bent = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         return bent * unit**2
-    found: Tensor = distance_loss(value, target, loss_function)
-    return found
+    loss: Tensor = distance_loss(value, target, loss_function)
+    return loss
 
 
 def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
@@ -173,18 +156,6 @@ def quantile_loss(quantiles: Tensor, target: Tensor) -> Tensor:
 def saturation(preactivation: Tensor, *, limit: float) -> Tensor:
     r"""Depth of actions in the flat ends of the tanh, the mean of :math:`\max(0, |u| - l)^2`."""
     return (preactivation.abs() - limit).clamp_min(0).square().mean()
-
-
-def action_gradient(value: Tensor, action: Tensor) -> Tensor:
-    r"""Gradient of each transition's Q by its own action, :math:`\nabla_a Q(s_i, a_i)` (Eq. 14).
-
-    The gradient of the sum has them all at once, as no transition enters another one's value;
-    layers that mix a batch (batch normalization) would break that.
-    """
-    (gradient,) = torch.autograd.grad(
-        value, action, grad_outputs=torch.ones_like(value), retain_graph=True
-    )
-    return gradient.detach()
 
 
 def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
@@ -229,39 +200,131 @@ def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
     )
 
 
-class Trust(NamedTuple):
-    """Weights of ReF-ER, which hold the actor near the behavior policy."""
-
-    policy: Tensor
-    """Weight of the actor's loss, shape ``[B]``."""
-    behavior: Tensor
-    """Weight of the divergence from the behavior, shape ``[B]``."""
-    mean: Tensor
-    """Mean of the behavior's actions, shape ``[B, A]``."""
-    sigma: Tensor
-    """Their standard deviation, shape ``[B, 1]``."""
-
-
-def read_trust(batch: TensorDictBase) -> Trust | None:
-    """Read the weights of ReF-ER; None if a batch has none, and the actor is free."""
-    if batch.get(POLICY_WEIGHT, None) is None:
-        return None
-    policy, behavior = batch[POLICY_WEIGHT].reshape(-1), batch[BEHAVIOR_WEIGHT].reshape(-1)
-    return Trust(policy, behavior, batch[BEHAVIOR_MEAN], batch[BEHAVIOR_SIGMA])
-
-
-def trusted_loss(loss: Tensor, action: Tensor, trust: Trust | None) -> Tensor:
-    r"""Loss of the actor with the divergence from the behavior, shape ``[B]``.
+def trusted_loss(loss: Tensor, action: Tensor, batch: TensorDictBase) -> Tensor:
+    r"""Compute the actor's loss with the weights of ReF-ER, if a batch has them, shape ``[B]``.
 
     .. math::
 
         w_i L_i + v_i \sum_a \frac{(a_i - \mu_i)^2}{2 \sigma_i^2}
 
-    The second term is the divergence of two Gaussians of one width, around the actor's action and
-    around the behavior's mean.
+    The second term holds the actor near the behavior: the divergence of two Gaussians of one width,
+    around the actor's action and around the behavior's mean.
     """
-    if trust is None:
+    if batch.get(POLICY_WEIGHT, None) is None:
         return loss
-    distance = ((action - trust.mean) / trust.sigma).square().sum(-1) / 2
-    found: Tensor = trust.policy * loss + trust.behavior * distance
-    return found
+    distance = ((action - batch[BEHAVIOR_MEAN]) / batch[BEHAVIOR_SIGMA]).square().sum(-1) / 2
+    held: Tensor = batch[BEHAVIOR_WEIGHT].reshape(-1) * distance
+    return batch[POLICY_WEIGHT].reshape(-1) * loss + held
+
+
+# The signals of TorchRL's own losses.
+
+_SQUARED = (
+    *(objectives.DDPGLoss, objectives.TD3Loss, objectives.TD3BCLoss, objectives.REDQLoss),
+    *(objectives.IQLLoss, objectives.CQLLoss, objectives.DQNLoss, objectives.DiscreteCQLLoss),
+)
+"""Losses that write the square of the TD error."""
+_ABSOLUTE = (
+    *(objectives.SACLoss, objectives.CrossQLoss, objectives.DiscreteSACLoss),
+    objectives.DistributionalDQNLoss,
+)
+"""Losses that write the absolute TD error; the distributional one a cross entropy in its place."""
+SUPPORTED = (*_SQUARED, *_ABSOLUTE)
+
+
+def write_signals(
+    batch: TensorDictBase, loss: objectives.LossModule, *, order: float = 2.0
+) -> None:
+    r"""Write the signals of Eqs. (13)-(14) in a batch that one of TorchRL's losses was called with.
+
+    The TD error is the largest of the critics, as TorchRL writes it. The slope is that of the first
+    critic in its evaluation mode, of quantiles that of their mean. The slope takes a forward and a
+    backward pass of its own: call this before the step of the optimizer, by which the critic would
+    be another one.
+
+    Args:
+        batch: Transitions, batch size ``[B]``, that ``loss(batch)`` was called with; gets
+            ``("signals", "td_error")`` and ``("signals", "action_gradient")``, each ``[B]``; of
+            ``N`` agents ``[B, N]``.
+        loss: ``DDPGLoss``, ``TD3Loss``, ``TD3BCLoss``, ``SACLoss``, ``REDQLoss``, ``CrossQLoss``,
+            ``IQLLoss``, ``CQLLoss`` or ``TQCLoss``; or ``DQNLoss``, ``DistributionalDQNLoss``,
+            ``DiscreteSACLoss``, ``DiscreteIQLLoss`` or ``DiscreteCQLLoss``, which have a TD error
+            alone.
+        order: Order of the norm in Eq. (14).
+
+    Raises:
+        KeyError: If the loss was not called with the batch.
+        TypeError: If the loss is another one.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import DDPGLoss, SoftUpdate
+        >>> from torchrl_mpfa import make_actor, make_critic
+        >>> loss = DDPGLoss(make_actor(24, 2), make_critic(24, 2))
+        >>> targets = SoftUpdate(loss, tau=0.01)
+        >>> end = torch.zeros(8, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.rand(8, 24), "reward": torch.rand(8, 1)}
+        >>> after |= {"done": end, "terminated": end}
+        >>> rows = {"observation": torch.rand(8, 24), "action": torch.rand(8, 2), "next": after}
+        >>> batch = TensorDict(rows, [8])
+        >>> _ = loss(batch)
+        >>> write_signals(batch, loss)
+        >>> sorted(batch["signals"].keys())
+        ['action_gradient', 'td_error']
+    """
+    if not isinstance(loss, SUPPORTED):
+        raise TypeError(
+            f"loss must be one of TorchRL's with a critic of actions, such as DDPGLoss, got "
+            f"{type(loss).__name__}: write batch['signals', 'td_error'] yourself"
+        )
+    key = loss.tensor_keys.priority
+    error = batch.get(key, None)
+    if error is None:
+        raise KeyError(
+            f"{key!r} is missing in the batch: call loss(batch) first. A part of a loss, such as "
+            "value_loss of TD3Loss, may return the error and not write it"
+        )
+    error = error.detach().reshape(len(batch), -1).squeeze(1)
+    # SAC with a network of state values writes the square, too.
+    squared = isinstance(loss, _SQUARED) or (
+        isinstance(loss, objectives.SACLoss) and "loss_value" in loss.out_keys
+    )
+    batch.set(TD_ERROR.key, error.sqrt() if squared else error.abs())
+    if hasattr(loss.tensor_keys, "state_action_value") and not isinstance(
+        loss, objectives.DiscreteIQLLoss
+    ):
+        value, action = _value_of_action(batch, loss)
+        # That of the sum: no transition enters another one's value.
+        (slope,) = torch.autograd.grad(value.sum(), action)
+        batch.set(ACTION_GRADIENT.key, action_gradient_priority(slope, order=order))
+
+
+def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
+    """Return Q of the stored actions by the first critic, ``[B]``, and the actions ``[B, A]``.
+
+    Of ``N`` agents ``[B, N]`` and ``[B, N, A]``.
+    """
+    name = "value_network" if isinstance(loss, objectives.DDPGLoss) else "qvalue_network"
+    critic, weights = getattr(loss, name), getattr(loss, f"{name}_params")
+    if name == "qvalue_network":
+        weights = weights[0]
+    keys = loss.tensor_keys
+    # TorchRL's DDPG has no name for the action.
+    key = getattr(keys, "action", None)
+    if key is None:
+        key = next(key for key in critic.in_keys if as_path(key)[-1] == "action")
+    inputs = batch.select(*critic.in_keys).detach()
+    action = inputs[key].clone().requires_grad_()
+    # Batch normalization counts, and dropout samples, in training alone.
+    in_training = [module for module in critic.modules() if module.training]
+    critic.eval()
+    with torch.enable_grad(), weights.detach().to_module(critic):
+        value: Tensor = critic(inputs.set(key, action))[keys.state_action_value]
+    for module in in_training:
+        module.training = True
+    return value.mean(-1) if value.ndim == action.ndim else value, action
+
+
+def __getattr__(name: str) -> Any:
+    """Say of a name that went what replaces it."""
+    return find(__name__, name, {})
