@@ -26,7 +26,10 @@ GONE = {
     "DQNLearner": _DQN,
     "MultiTensorSoftUpdate": "TorchRL's SoftUpdate: a learner moves its targets itself",
     "ReplayHistory": "torchrl_mpfa.history.ReplayHistory",
-    "TabularQLearner": "torchrl_mpfa.learners.TabularQLearner",
+    **dict.fromkeys(
+        ("TabularQLearner", "make_value_table"),
+        "examples/training/run/q_learning.py, which train.py has for learner=q_learning",
+    ),
     "hydra": "nothing: a Hydra file names each part as _target_",
     "SignalStorageMixin": "nothing: the sampler keeps the signals",
     "SignalTable": "torchrl_mpfa.samplers.SignalTable",

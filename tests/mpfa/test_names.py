@@ -15,7 +15,7 @@ PACKAGES = {
     "SignalLoss": [LOSSES],
     "MultiTensorSoftUpdate": [LEARNERS],
     "ReplayHistory": ["torchrl_mpfa"],
-    "TabularQLearner": ["torchrl_mpfa"],
+    "make_value_table": ["torchrl_mpfa.networks"],
     "check_adjustment": ["torchrl_mpfa.testing"],
     "check_fusion": ["torchrl_mpfa.testing"],
 }

@@ -19,7 +19,6 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.checks import COUNT, SHARE, check
 from torchrl_mpfa.history import ReplayHistory
-from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.hvper import HVPERPenalty, ScheduledFusion
@@ -28,7 +27,6 @@ from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSelection
-from torchrl_mpfa.networks import make_value_table
 
 HALF, THREE = np.float32(0.5), np.int64(3)
 
@@ -75,12 +73,6 @@ KEPT = {
     ),
     "lowered rates": lambda: annealed(make_learner("ddpg"), HALF).state_dict(),
     "rate of Q": lambda: make_discrete(lr=HALF, weight_decay=HALF).state_dict(),
-    "rate of a table": lambda: annealed(
-        TabularQLearner(
-            make_value_table(lambda seen: seen[..., 0].long(), THREE, THREE), lr=HALF, gamma=HALF
-        ),
-        HALF,
-    ),
     "capacity and batch": lambda: SignalReplayBuffer(
         storage=SignalTensorStorage(np.int64(8)),
         sampler=MPFASampler(np.int64(8), HALF, HALF, HALF, positive_above=HALF),

@@ -4,10 +4,10 @@ from typing import Any
 
 from torchrl_mpfa.lazy import find
 from torchrl_mpfa.learners.actor_critic import ActorCritic
-from torchrl_mpfa.learners.dqn import DQN, TabularQLearner
+from torchrl_mpfa.learners.dqn import DQN
 from torchrl_mpfa.learners.optimized import Learner
 
-__all__ = ["DQN", "ActorCritic", "Learner", "TabularQLearner"]
+__all__ = ["DQN", "ActorCritic", "Learner"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,22 +1,19 @@
-"""DQN and Q learning: the policy is the greatest of the values of a few actions."""
+"""DQN: the policy is the greatest of the values of a few actions."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.checks import check_alike, check_losses
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
 from torchrl_mpfa.losses import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
-from torchrl_mpfa.networks.values import ValueTable
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
@@ -24,7 +21,7 @@ from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 _DISTANCES = ("l1", "l2", "smooth_l1")
 
 
-def _whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
+def whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
     """Return the sampled batch, which must be for actor and critic alike."""
     sampled = as_sampled(sampled)
     if sampled.trains != "both" or sampled.loss_function is not None:
@@ -124,7 +121,7 @@ class DQN(OptimizedLearner):
             ValueError: If the loss is not finite, the actions have neither form, or the batch is
                 for an actor or critic alone; nothing is changed then.
         """
-        return super().update(_whole_batch(sampled, self))
+        return super().update(whole_batch(sampled, self))
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
@@ -153,125 +150,3 @@ class DQN(OptimizedLearner):
     def _states_of(self, source: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Read the inputs of the network, without gradients."""
         return {key: source[key].detach() for key in self.policy.in_keys}
-
-
-class TabularQLearner:
-    r"""Q learning (Watkins 1989) of a table, from batches of any replay.
-
-    Each transition of a batch has a TD error :math:`\delta_i = r_i + \gamma \max_a Q(s'_i, a) -
-    Q(s_i, a_i)`, all of them by the table before the update. An entry of the table moves by the
-    learning rate times the mean of :math:`w_i \delta_i` over those transitions of the batch that
-    are its own. With a batch of one, the newest, this is Q learning as it was first described:
-    ``make_replay("cer", batch_size=1)``.
-
-    Args:
-        policy: The table with its cells, out of :func:`~torchrl_mpfa.networks.make_value_table`.
-        lr: Learning rate.
-        gamma: Discount, in [0, 1].
-        importance: True to scale TD errors by the importance weights of a batch, if it has them.
-
-    Raises:
-        TypeError: If the policy is no table.
-        ValueError: If an argument is out of its range.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from torchrl_mpfa.networks import make_value_table
-        >>> policy = make_value_table(lambda seen: (seen[..., 0] > 0.5).long(), 2, 3)
-        >>> learner = TabularQLearner(policy, lr=0.5)
-        >>> end = torch.ones(1, 1, dtype=torch.bool)
-        >>> after = {"observation": torch.ones(1, 1), "reward": torch.ones(1, 1), "terminated": end}
-        >>> choice = torch.tensor([[0, 1, 0]])
-        >>> rows = {"observation": torch.ones(1, 1), "action": choice, "next": after}
-        >>> _ = learner.update(TensorDict(rows, [1]))
-        >>> policy.module.table.tolist()
-        [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]]
-    """
-
-    def __init__(
-        self,
-        policy: DirectModule,
-        *,
-        lr: float = 0.2,
-        gamma: float = 0.99,
-        importance: bool = True,
-    ) -> None:
-        if not isinstance(getattr(policy, "module", None), ValueTable):
-            raise TypeError(f"policy must be one of make_value_table, got {type(policy).__name__}")
-        self._rate = self._first_rate = check(ABOVE_ZERO, lr=lr)
-        self.gamma = check(SHARE, gamma=gamma)
-        self.policy, self.importance = policy, importance
-        self.updates = 0
-        """Training steps taken."""
-
-    @property
-    def table(self) -> Tensor:
-        """Values of all cells, shape ``[cells, K]``."""
-        found: Tensor = self.policy.module.table
-        return found
-
-    @torch.no_grad()
-    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
-        """Move the entries that the transitions of a batch belong to.
-
-        Args:
-            sampled: As in :meth:`DQN.update`; actions are one-hot, ``[B, K]``, or numbers.
-
-        Returns:
-            Values for the log.
-
-        Raises:
-            KeyError: If the batch lacks an entry.
-            ValueError: If a number is not finite, the actions have neither form, or the batch is
-                for an actor or critic alone; nothing is changed then.
-        """
-        batch = _whole_batch(sampled, self)
-        cell_of, table = self.policy.module.cell_of, self.table
-        action = read_choices(batch["action"], table.shape[1], batch)
-        entry = cell_of(batch["observation"]) * table.shape[1] + action
-        ahead = table[cell_of(batch["next", "observation"])].amax(-1)
-        target = target_of(batch, ahead, gamma=self.gamma)
-        td_error = target - table.view(-1)[entry]
-        squared, value = td_error.square(), table.view(-1)[entry]
-        log = {"loss_value": squared.mean(), "td_error": squared, "pred_value": value}
-        step = td_error
-        if self.importance and "priority_weight" in batch.keys():  # noqa: SIM118
-            step = td_error * batch["priority_weight"].reshape(-1)
-        check_losses({**log, "loss_step": step}, batch)
-        batch.set(TD_ERROR.key, td_error.abs())
-        total = torch.zeros(table.numel()).index_add_(0, entry, step)
-        count = torch.bincount(entry, minlength=table.numel()).clamp_min(1)
-        table.view(-1).add_(total / count, alpha=self._rate)
-        self.updates += 1
-        return log
-
-    def end_episode(self) -> None:
-        """Change nothing."""
-
-    def anneal(self, factor: float) -> None:
-        """Set the learning rate to a fraction of the constructor's.
-
-        Args:
-            factor: The fraction, in [0, 1].
-
-        Raises:
-            ValueError: If ``factor`` is outside.
-        """
-        self._rate = self._first_rate * check(SHARE, factor=factor)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the table and the count."""
-        return {"networks": {"table": self.table.clone()}, "updates": self.updates}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state from :meth:`state_dict`.
-
-        Args:
-            state_dict: The state of a learner with a table of the same size.
-
-        Raises:
-            ValueError: If its table is of another size, or not finite; nothing is changed then.
-        """
-        check_alike("learner", state_dict, self.state_dict())
-        self.table.copy_(state_dict["networks"]["table"])
-        self.updates = state_dict["updates"]

@@ -1,5 +1,8 @@
 """Actors and critics."""
 
+from typing import Any
+
+from torchrl_mpfa.lazy import find
 from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
 from torchrl_mpfa.networks.deterministic import (
     Actor,
@@ -7,6 +10,7 @@ from torchrl_mpfa.networks.deterministic import (
     DirectModule,
     make_actor,
     make_critic,
+    make_value_network,
 )
 from torchrl_mpfa.networks.stochastic import (
     StochasticActor,
@@ -14,7 +18,6 @@ from torchrl_mpfa.networks.stochastic import (
     make_stochastic_actor,
     sample_tanh_normal,
 )
-from torchrl_mpfa.networks.values import make_value_network, make_value_table
 
 __all__ = [
     "ActionScale",
@@ -28,6 +31,10 @@ __all__ = [
     "make_critic",
     "make_stochastic_actor",
     "make_value_network",
-    "make_value_table",
     "sample_tanh_normal",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Say of a name that went what replaces it."""
+    return find(__name__, name, {})

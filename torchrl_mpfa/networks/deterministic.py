@@ -1,4 +1,4 @@
-"""Actor and critic for DDPG and TD3, with the options that keep them from collapsing.
+"""Actor, critic and values of choices, with the options that keep them from collapsing.
 
 Plain multi-layer perceptrons were seen to saturate the actor's tanh within some fifty episodes:
 the robot then circles. The defaults follow the original DDPG paper (Lillicrap et al. 2016,
@@ -20,6 +20,9 @@ from torchrl.data import TensorSpec
 
 from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, check_counts, keep
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
+
+OUT_KEYS = ["action_value", "action", "chosen_action_value"]
+"""What a network of values writes."""
 
 
 class DirectModule(TensorDictModule):
@@ -150,6 +153,29 @@ class Critic(nn.Module):
         return value
 
 
+class ValueNetwork(nn.Module):
+    """A perceptron with an output for each action."""
+
+    def __init__(self, observation_size: int, actions: int, perceptron: Perceptron) -> None:
+        super().__init__()
+        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
+        self.head = perceptron.last(actions)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Map ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        return with_best(self.head(self.body(observation)))
+
+    def layers(self) -> list[nn.Module]:
+        """Return all layers in their order, from observation to values."""
+        return [*self.body, self.head]
+
+
+def with_best(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return values, the greatest as a one-hot choice, and the greatest value."""
+    choice = nn.functional.one_hot(values.argmax(-1), values.shape[-1])
+    return values, choice, values.amax(-1, keepdim=True)
+
+
 def make_actor(
     observation_size: int,
     action_size: int,
@@ -236,3 +262,38 @@ def make_critic(
         raise ValueError(f"layers must be at least 2 with late_action, got {layers}")
     critic = Critic(observation_size, action_size, perceptron, late_action=late_action)
     return DirectModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])
+
+
+def make_value_network(
+    observation_size: int,
+    actions: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+) -> DirectModule:
+    """Make a network from ``"observation"`` to a value for each action, and the best one, one-hot.
+
+    Args:
+        observation_size: ``O``.
+        actions: Number of actions ``K``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
+        final_init: As in :func:`~torchrl_mpfa.make_actor`.
+
+    Returns:
+        A module for :class:`~torchrl_mpfa.DQN` and TorchRL's ``DQNLoss``.
+
+    Raises:
+        ValueError: If a size is not a positive integer.
+
+    Examples:
+        >>> make_value_network(24, 7).outputs({"observation": torch.rand(5, 24)})["action"].shape
+        torch.Size([5, 7])
+    """
+    check_counts(observation_size=observation_size, actions=actions)
+    perceptron = Perceptron(width, layers, layer_norm, final_init)
+    network = ValueNetwork(observation_size, actions, perceptron)
+    return DirectModule(network, in_keys=["observation"], out_keys=OUT_KEYS)

@@ -22,13 +22,13 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     make_value_network,
 )
-from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
-from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
-from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
+from torchrl_mpfa.networks import DirectModule, StochasticActor
+from torchrl_mpfa.networks.deterministic import ValueNetwork
 from training.plugins import SIGNALS
 from training.run.driving import Robots
+from training.run.q_learning import TabularQLearner, ValueTable, make_value_table
 from training.settings.learners import LearnerSettings, is_discrete
 from training.settings.train import TrainSettings
 

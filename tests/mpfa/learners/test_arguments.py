@@ -18,7 +18,6 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     make_value_network,
 )
-from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.learners.optimized import make_optimizer
 from torchrl_mpfa.losses import distance
 from torchrl_mpfa.methods.curiosity import Curiosity
@@ -32,7 +31,6 @@ from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSelection
-from torchrl_mpfa.networks import make_value_table
 
 NAN, INF = math.nan, math.inf
 NO_COUNT = "must be an integer from 1 to 2147483647, got"
@@ -45,7 +43,6 @@ NETWORKS = {
     make_critic: SIZES,
     make_stochastic_actor: SIZES,
     make_value_network: {"observation_size": 3, "actions": 2, "width": 8, "layers": 2},
-    make_value_table: {"cells": 3, "actions": 2},
 }
 SPEC = Bounded(low=-1.0, high=1.0, shape=(2,))
 TWO_SPECS = Bounded(
@@ -65,8 +62,7 @@ SPECS = [
 
 def network_with(make, **given):
     """Make a network by valid arguments with some replaced."""
-    given = {**NETWORKS[make], **given}
-    return make(len, **given) if make is make_value_table else make(**given)
+    return make(**{**NETWORKS[make], **given})
 
 
 def of_ten(kind):
@@ -134,7 +130,6 @@ ROWS = [
     *rows(make_discrete, "lr", (0.0,), NOT_POSITIVE),
     *rows(make_discrete, "weight_decay", (-0.1,), NEGATIVE),
     *rows(make_discrete, "tau", (0.0,), r"must be in \(0, 1\], got"),
-    (partial(TabularQLearner, make_value_table(len, 3, 2)), {"lr": 0.0}, "lr must be in"),
     (partial(make_optimizer, groups=[]), {"name": "sgd"}, "optimizer must be .* got 'sgd'"),
     # Networks.
     *[
@@ -249,16 +244,9 @@ def test_critic_without_a_layer_of_one_output_has_no_quantiles():
         make_learner(networks=(make_networks()[0], critic), signals=["information_gain"])
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: DQN(nn.Linear(4, 5)), "network must be a DirectModule, got Linear"),
-        (lambda: TabularQLearner(make_value_network(4, 5)), "policy must be one of make_value_tab"),
-    ],
-)
-def test_network_of_another_kind_is_rejected(make, words):
-    with pytest.raises(TypeError, match=words):
-        make()
+def test_network_of_another_kind_is_rejected():
+    with pytest.raises(TypeError, match="network must be a DirectModule, got Linear"):
+        DQN(nn.Linear(4, 5))
 
 
 def test_sampler_of_reliability_rejects_signals_without_the_td_error():

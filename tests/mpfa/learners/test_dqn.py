@@ -1,4 +1,4 @@
-"""DQN and Q learning, against plain loops."""
+"""DQN, against plain loops."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from torchrl_mpfa import (
     make_value_network,
     run_updates,
 )
-from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import make_replay
-from torchrl_mpfa.networks import make_value_table
 from torchrl_mpfa.selection import SampledBatch
 
 ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
@@ -45,6 +43,10 @@ def transitions(count=12, seed=0):
 def network(seed=0):
     torch.manual_seed(seed)
     return make_value_network(SIZE, ACTIONS, width=8, final_init=None)
+
+
+def make_dqn():
+    return DQN(network(), lr=0.01)
 
 
 @pytest.mark.parametrize("double", [True, False])
@@ -102,45 +104,8 @@ def test_huber_loss_bends_at_one_in_units_of_the_reward():
     torch.testing.assert_close(batch["signals", "td_error"], squares["signals", "td_error"])
 
 
-def cell_of(observation):
-    return (observation[..., 0] * 3).long()
-
-
-@pytest.mark.parametrize("importance", [True, False])
-def test_update_of_the_table_is_that_of_a_plain_dict(importance):
-    learner = TabularQLearner(
-        make_value_table(cell_of, 3, ACTIONS), lr=0.5, gamma=GAMMA, importance=importance
-    )
-    table = {(cell, action): 0.0 for cell in range(3) for action in range(ACTIONS)}
-    for seed in range(4):
-        batch, moves, errors = transitions(30, seed=seed), {}, []
-        for row in batch:
-            cell, then = int(cell_of(row["observation"])), int(cell_of(row["next", "observation"]))
-            ahead = max(table[then, action] for action in range(ACTIONS))
-            goes_on = not bool(row["next", "terminated"])
-            entry = cell, int(row["action"].argmax())
-            error = float(row["next", "reward"]) + GAMMA * ahead * goes_on - table[entry]
-            weight = float(row["priority_weight"]) if importance else 1.0
-            moves.setdefault(entry, []).append(weight * error)
-            errors.append(abs(error))
-        for entry, steps in moves.items():
-            table[entry] += 0.5 * sum(steps) / len(steps)
-        learner.update(SampledBatch(batch))
-        assert batch["signals", "td_error"].tolist() == pytest.approx(errors, abs=1e-4)
-    for (cell, action), value in table.items():
-        assert learner.table[cell, action].item() == pytest.approx(value, abs=1e-4)
-
-
-def learners():
-    return [
-        DQN(network(), lr=0.01),
-        TabularQLearner(make_value_table(cell_of, 3, ACTIONS)),
-    ]
-
-
-@pytest.mark.parametrize("kind", [0, 1])
-def test_learner_with_a_loaded_state_learns_like_the_saved_one(kind):
-    first, second = learners()[kind], learners()[kind]
+def test_learner_with_a_loaded_state_learns_like_the_saved_one():
+    first, second = make_dqn(), make_dqn()
     assert isinstance(first, Learner)
     first.anneal(0.5)
     first.update(transitions())
@@ -155,9 +120,8 @@ def test_learner_with_a_loaded_state_learns_like_the_saved_one(kind):
     assert values[0].abs().max() > 0
 
 
-@pytest.mark.parametrize("kind", [0, 1])
-def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
-    learner = learners()[kind]
+def test_bad_batch_or_state_is_rejected_and_changes_nothing():
+    learner = make_dqn()
     before = copy.deepcopy(learner.state_dict())
     spoiled = transitions()
     spoiled["next", "reward"][3] = torch.nan
@@ -177,7 +141,7 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
             learner.update(transitions().exclude(missing))
     with pytest.raises(ValueError, match=r"the saved learner.* lacks"):
         learner.load_state_dict({"networks": {}, "updates": 3})
-    other = learners()[kind]
+    other = make_dqn()
     other.update(transitions())
     with pytest.raises(ValueError, match="the saved learner, 'updates' must be 0, got 'some'"):
         learner.load_state_dict({**other.state_dict(), "updates": "some"})
@@ -188,19 +152,17 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
     )
 
 
-@pytest.mark.parametrize("kind", [0, 1])
-def test_ends_that_are_bytes_count_as_booleans(kind):
+def test_ends_that_are_bytes_count_as_booleans():
     batch, numbers = transitions(), transitions()
     for key in ("done", "terminated"):
         numbers["next", key] = numbers["next", key].to(torch.uint8)
     for each in (batch, numbers):
-        learners()[kind].update(each)
+        make_dqn().update(each)
     assert torch.equal(batch["signals", "td_error"], numbers["signals", "td_error"])
 
 
-@pytest.mark.parametrize("kind", [0, 1])
 @pytest.mark.parametrize("form", ["booleans", "floats", "column", "numbers", "column of floats"])
-def test_every_form_of_an_action_is_learned_from_alike(kind, form):
+def test_every_form_of_an_action_is_learned_from_alike(form):
     batch, other = transitions(), transitions()
     hot = batch["action"]
     number = hot.argmax(-1)
@@ -212,11 +174,10 @@ def test_every_form_of_an_action_is_learned_from_alike(kind, form):
         "column of floats": number.float().unsqueeze(1),
     }[form]
     for each in (batch, other):
-        learners()[kind].update(each)
+        make_dqn().update(each)
     assert torch.equal(batch["signals", "td_error"], other["signals", "td_error"])
 
 
-@pytest.mark.parametrize("kind", [0, 1])
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -232,8 +193,8 @@ def test_every_form_of_an_action_is_learned_from_alike(kind, form):
         lambda hot: hot[:, :1].bool(),
     ],
 )
-def test_bad_action_is_rejected_by_name_and_changes_nothing(kind, spoil):
-    learner = learners()[kind]
+def test_bad_action_is_rejected_by_name_and_changes_nothing(spoil):
+    learner = make_dqn()
     before, batch = copy.deepcopy(learner.state_dict()["networks"]), transitions()
     batch["action"] = spoil(batch["action"])
     with pytest.raises(ValueError, match=f"action must be one-hot among {ACTIONS}"):
@@ -242,16 +203,15 @@ def test_bad_action_is_rejected_by_name_and_changes_nothing(kind, spoil):
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
-@pytest.mark.parametrize("kind", [0, 1])
-def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
-    learner = learners()[kind]
+def test_transitions_of_several_steps_are_discounted_by_all_of_them():
+    learner = make_dqn()
     learner.update(transitions(seed=5))  # Values that are not zero.
     batch = transitions()
     batch["steps_to_next_obs"] = torch.arange(1, 13).reshape(-1, 1)
     seen = {"observation": batch["next", "observation"]}
     with torch.no_grad():
         best = learner.policy.outputs(seen)["action"]
-        ahead = (learner.targets["value"] if kind == 0 else learner.policy).outputs(seen)
+        ahead = (learner.targets["value"]).outputs(seen)
         ahead = ahead["action_value"]
         here = learner.policy.outputs({"observation": batch["observation"]})["action_value"]
     expected = []
@@ -264,8 +224,7 @@ def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
     assert batch["signals", "td_error"].tolist() == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("kind", [0, 1])
-def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
+def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals():
     replay = make_replay(
         "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
         generator=torch.Generator().manual_seed(0),
@@ -274,20 +233,10 @@ def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     rows["next", "reward"] = rows["action"][:, 2:3].float()
     rows["next", "terminated"][:] = True
     replay.buffer.extend(rows.exclude("priority_weight"))
-    learner = learners()[kind]
+    learner = make_dqn()
     for _ in range(60):
         run_updates(replay.buffer, learner, replay.select, updates=4)
     found = learner.policy.outputs({"observation": torch.rand(50, SIZE)})
     assert (found["action"].argmax(-1) == 2).all()
     assert (found["action"].sum(-1) == 1).all()
     assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
-
-
-def test_rate_of_a_table_follows_annealing():
-    learner = TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
-    row = transitions(1).exclude("priority_weight")
-    row["next", "reward"][:], row["next", "terminated"][:] = 8.0, True
-    for fraction, expected in ((1.0, 4.0), (0.25, 4.0 + 0.125 * 4.0), (0.0, 4.5)):
-        learner.anneal(fraction)
-        learner.update(row)
-        assert float(learner.table.sum()) == pytest.approx(expected)
