@@ -12,8 +12,7 @@ from torch import Tensor
 
 from benchmarks.values.learning import SignalFunction, mirror
 from torchrl_mpfa.learners import ActorCritic
-from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Method, Prioritized, Scaled
-from torchrl_mpfa.methods.mpfa import Adjusted
+from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Adjusted, Method, Prioritized, Scaled
 
 LEFT_OUT = {
     "rud": "the policy is held anyway: it is uniform replay",

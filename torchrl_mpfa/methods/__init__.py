@@ -12,16 +12,15 @@ if TYPE_CHECKING:
     from torchrl_mpfa.methods.base import Prioritized as Prioritized
     from torchrl_mpfa.methods.catalogue import ALIASES as ALIASES
     from torchrl_mpfa.methods.catalogue import METHODS as METHODS
+    from torchrl_mpfa.methods.catalogue import MPFA as MPFA
+    from torchrl_mpfa.methods.catalogue import Adjusted as Adjusted
+    from torchrl_mpfa.methods.catalogue import Scaled as Scaled
     from torchrl_mpfa.methods.catalogue import method_named as method_named
-    from torchrl_mpfa.methods.mpfa import MPFA as MPFA
-    from torchrl_mpfa.methods.mpfa import Adjusted as Adjusted
-    from torchrl_mpfa.methods.mpfa import Scaled as Scaled
 
 _NAMES = {
     "assembly": "Replay loss_options make_replay",
     "base": "Method Prioritized",
-    "catalogue": "ALIASES METHODS method_named",
-    "mpfa": "Adjusted MPFA Scaled",
+    "catalogue": "ALIASES METHODS MPFA Adjusted Scaled method_named",
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))

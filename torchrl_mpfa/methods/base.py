@@ -72,10 +72,13 @@ class Method:
     """Arguments of :func:`make_replay` that the method cannot do without."""
     why: ClassVar[str] = ""
     """Reason why the method needs these arguments."""
-    plain: ClassVar[bool] = True
-    """True if the method trains by one batch of its buffer for each update, and no more."""
     needs_actor: ClassVar[bool] = False
     """True if the method is only for learners with an actor."""
+    # A method that can change one of these has a setting of its name.
+    target_average = 1
+    """Critics of which the target is the mean."""
+    curiosity = 0.0
+    """Factor of the bonus for outcomes that the robot could not predict (ICM); 0: none."""
 
     def __init_subclass__(cls) -> None:
         if "kept_signals" in vars(cls):
@@ -93,19 +96,9 @@ class Method:
         return self.batch_size
 
     @property
-    def target_average(self) -> int:
-        """Critics of which the target is the mean."""
-        return 1
-
-    @property
     def pal_alpha(self) -> float:
         """Exponent of the loss PAL."""
         return 0.4
-
-    @property
-    def curiosity(self) -> float:
-        """Factor of the bonus for outcomes that the robot could not predict (ICM); 0: none."""
-        return 0.0
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -173,11 +166,8 @@ class Prioritized(Method):
     """True: a fresh transition gets the highest priority in the buffer; false: the highest ever."""
     stratified: bool = within(SWITCH, False)
     """True: a batch has one transition from each of equal parts of the total priority."""
-
-    @property
-    def positive_above(self) -> Any:
-        """Reward above which a transition is positive, for fusion and adjustments."""
-        return 0.0
+    positive_above = 0.0
+    """Reward above which a transition is positive, for fusion and adjustments; no setting here."""
 
     def beta_at(self, fraction: float) -> float:
         """Return the importance exponent after a part of the training (Eq. 10)."""

@@ -9,14 +9,99 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, unknown
-from torchrl_mpfa.methods.base import Method, Prioritized, one_of, within
-from torchrl_mpfa.methods.mpfa import MPFA, Adjusted, Scaled
+from torchrl_mpfa.checks import BELOW_ONE, COUNT, LEVEL, NOT_NEGATIVE, POSITIVE, SHARE, unknown
+from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
 
 if TYPE_CHECKING:
     from torchrl_mpfa.adjustment import Adjustment
     from torchrl_mpfa.fusion import Fusion
     from torchrl_mpfa.selection import Selection
+
+
+@dataclass
+class Adjusted(Prioritized):
+    """PER whose priorities of positive transitions are raised and decayed (Eqs. 22-24)."""
+
+    boost: bool = within(SWITCH, False)
+    """Raise positive transitions, Eq. 22."""
+    boost_factor: float = within(POSITIVE, 3.0)
+    """phi of Eq. 22; its upper bound where ``boost_target`` is above 0."""
+    boost_target: float = within(BELOW_ONE, 0.0)
+    """Share of the total priority that positive transitions are to have, by a phi that follows how
+    rare they are in the buffer; 0: phi is fixed."""
+    boost_bound: str = one_of("floor", "cap", "none")
+    """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
+    decay: bool = within(SWITCH, False)
+    """Decay positive transitions above the batch mean, Eqs. 23-24."""
+    decay_sharpness: float = within(POSITIVE, 0.01)
+    """sigma of Eq. 23."""
+    decay_position: str = one_of("batch", "rank", "count")
+    """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
+    positive_above: Any = field(default=0.0, metadata={"rule": LEVEL})
+    """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
+    ``mean``, the mean reward of the buffer, for rewards of one sign."""
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the boost and the decay that are on."""
+        from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
+
+        parts: list[Adjustment] = []
+        if self.boost:
+            boost = PositiveBoost(
+                boost=self.boost_factor,
+                bound=self.boost_bound,  # type: ignore[arg-type]
+                target_share=self.boost_target,
+            )
+            parts.append(boost)
+        if self.decay:
+            decay = PositiveDecay(
+                sharpness=self.decay_sharpness,
+                position=self.decay_position,  # type: ignore[arg-type]
+            )
+            parts.append(decay)
+        return parts
+
+
+@dataclass
+class MPFA(Adjusted):
+    """MPFA-PER: signals weighted by information entropy (Eqs. 15-21), raised and decayed."""
+
+    name: str = "mpfa_per"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    boost: bool = True
+    decay: bool = True
+    weight_floor: float = within(BELOW_ONE, 0.0)
+    """Least weight of a signal: without one the reward alone counts until the first goal; 0: none,
+    as in the paper."""
+    population: str = one_of("buffer", "batch")
+    """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
+
+    def fusion(self) -> Fusion:
+        """Make the fusion by entropy weights."""
+        from torchrl_mpfa.fusion import EntropyFusion
+
+        return EntropyFusion(
+            population=self.population,  # type: ignore[arg-type]
+            floor=self.weight_floor,
+        )
+
+
+@dataclass
+class Scaled(Adjusted):
+    """Signals in equal shares: each is divided by its mean."""
+
+    name: str = "mpfa_plus"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    # Signals are in units of their means, of which a floor of 1 is not one.
+    boost_bound: str = "none"
+    # More than a step can bring, and less than a goal.
+    positive_above: Any = 1.0
+
+    def fusion(self) -> Fusion:
+        """Make the fusion in equal shares."""
+        from torchrl_mpfa.fusion import ScaledFusion
+
+        return ScaledFusion(super().fusion())
 
 
 @dataclass
@@ -140,7 +225,6 @@ class LA3P(LAP):
     name: str = "la3p"
     # Its parts have losses of their own: PAL on the uniform one, Huber on the prioritized one.
     loss_function: str = one_of("smooth_l1")
-    plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
 
     @property
@@ -195,7 +279,6 @@ class UniformHalves(Method):
     batches: ClassVar[str] = "torchrl_mpfa.methods.la3p.uniform_halves"
 
     name: str = "uniform_halves"
-    plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
 
 
@@ -208,7 +291,6 @@ class KLPER(Method):
     """Batches of which the most on-policy one is trained on."""
     needs: ClassVar[tuple[str, ...]] = ("policy", "sigma")
     why: ClassVar[str] = "it chooses on-policy batches"
-    plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
 
     @property
@@ -236,7 +318,6 @@ class ReFER(Method):
     """C: a ratio of densities of 1 + C or its inverse is far."""
     needs: ClassVar[tuple[str, ...]] = ("policy",)
     why: ClassVar[str] = "it compares actions with its own"
-    plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
 
     @property
