@@ -159,18 +159,7 @@ def saturation(preactivation: Tensor, *, limit: float) -> Tensor:
 
 
 def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
-    """Read the numbers of actions among ``K``, shape ``[B]``, given one-hot or as numbers.
-
-    Args:
-        action: One-hot, ``[B, K]``, or numbers, ``[B]`` or ``[B, 1]``.
-        count: ``K``.
-        batch: The batch that has them.
-
-    Returns:
-        The numbers.
-
-    Raises:
-        ValueError: If the actions have neither form.
+    """Read the numbers, ``[B]``, of actions among ``K``: one-hot, or numbers ``[B]`` or ``[B, 1]``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -189,14 +178,11 @@ def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
         number = action.reshape(batch.shape)
         if bool(((number >= 0) & (number < count) & (number == number.long())).all()):
             return number.long()
+    fits = form in ((count,), (), (1,))
+    numbers = f": {action.reshape(-1)[: 2 * count].tolist()}" if fits else ""
     raise ValueError(
         f"action must be one-hot among {count}, shape {[*batch.shape, count]}, or the number of "
-        f"one, shape {[*batch.shape, 1]}, got {action.dtype} of shape {[*action.shape]}"
-        + (
-            ""
-            if form not in ((count,), (), (1,))
-            else f": {action.reshape(-1)[: 2 * count].tolist()}"
-        )
+        f"one, shape {[*batch.shape, 1]}, got {action.dtype} of shape {[*action.shape]}{numbers}"
     )
 
 

@@ -94,7 +94,7 @@ def information_gain_priority(
     Examples:
         >>> quantiles = torch.tensor([[-1.0, 1.0], [-3.0, 3.0]])
         >>> gain = information_gain_priority(torch.tensor([[1.0, 3.0], [1.0, 3.0]]), quantiles)
-        >>> [round(each, 3) for each in gain.tolist()]  # ln(1 + 1 / 1) / 2 and ln(1 + 9 / 9) / 2
+        >>> [round(n, 3) for n in gain.tolist()]  # ln(1 + 1 / 1) / 2 and ln(1 + 9 / 9) / 2
         [0.347, 0.347]
     """
     epistemic = td_error.square().mean(0)

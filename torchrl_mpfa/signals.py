@@ -61,7 +61,6 @@ class Signal:
 REWARD = Signal("reward", key=("next", "reward"), known_at="write", priority=reward_priority)
 TD_ERROR = Signal("td_error")
 ACTION_GRADIENT = Signal("action_gradient")
-INFORMATION_GAIN = Signal("information_gain")
 
 MPFA_SIGNALS: tuple[Signal, ...] = (REWARD, TD_ERROR, ACTION_GRADIENT)
 """The three signals of Eqs. (12)-(14)."""

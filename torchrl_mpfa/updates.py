@@ -107,8 +107,8 @@ def _sample(buffer: TensorDictReplayBuffer, batches: int) -> SampledBatch:
 
 def _learn(learner: Learner, sampled: SampledBatch, keys: Sequence[NestedKey]) -> dict[str, Tensor]:
     """Make an update with each batch, which write these entries; return values for the log."""
-    each = getattr(learner, "update_each", None) if sampled.batches > 1 else None
-    if each is not None and (log := each(sampled.batch, sampled.batches)) is not None:
+    update_each = getattr(learner, "update_each", None) if sampled.batches > 1 else None
+    if update_each and (log := update_each(sampled.batch, sampled.batches)) is not None:
         return dict(log)
     parts = sampled.parts()
     for part in parts:

@@ -18,7 +18,7 @@ def make_own_step(learner: ActorCritic, batch: TensorDict) -> Call:
     """Forward and backward pass of a learner, with its signals."""
 
     def step() -> None:
-        learner.clear_gradients()
+        learner.optimizer.zero_grad()
         learner._differentiate(batch.copy(), "both", None)
 
     return step

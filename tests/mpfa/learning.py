@@ -116,7 +116,7 @@ def make_discrete(size=5, **options):
 def differentiate(learner, batch, *, seed=1, trains="both", loss_function=None):
     """Set gradients and write signals without a step, by these random numbers; return the log."""
     torch.manual_seed(seed)
-    learner.clear_gradients()
+    learner.optimizer.zero_grad()
     return learner._differentiate(batch, trains, loss_function)
 
 

@@ -16,6 +16,7 @@ from torchrl.trainers import (
     Trainer,
 )
 
+from torchrl_mpfa.checks import kind_of
 from torchrl_mpfa.losses import SUPPORTED, write_signals
 from torchrl_mpfa.signals import TD_ERROR
 
@@ -50,7 +51,7 @@ class PriorityStepper(OptimizationStepper):
     def __init__(self, stepper: OptimizationStepper | None = None) -> None:
         stepper = DefaultOptimizationStepper() if stepper is None else stepper
         if not isinstance(stepper, OptimizationStepper):
-            raise TypeError(f"stepper must be an OptimizationStepper, got {_name(stepper)}")
+            raise TypeError(f"stepper must be an OptimizationStepper, got {kind_of(stepper)}")
         self.stepper = stepper
         self.priority_updates = 0
         """Number of batches whose priorities were updated."""
@@ -105,7 +106,7 @@ def buffer_of(trainer: Trainer) -> Any:
     """Return the replay buffer of a trainer, which must have one."""
     replay_buffer = getattr(trainer, "replay_buffer", None)
     if replay_buffer is None:
-        raise ValueError(f"replay_buffer of the trainer must not be None, got {_name(trainer)}")
+        raise ValueError(f"replay_buffer of the trainer must not be None, got {kind_of(trainer)}")
     return replay_buffer
 
 
@@ -118,7 +119,3 @@ class _WithoutPriorities:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._trainer, name)
-
-
-def _name(thing: object) -> str:
-    return type(thing).__name__

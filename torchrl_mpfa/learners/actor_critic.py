@@ -344,7 +344,10 @@ class ActorCritic(OptimizedLearner):
             return torch.stack([self._value(critic, states, action) for critic in critics])
         past = self.networks["past"]
         sets = [*past.states, critics]
-        values = [[self._value(critic, states, action) for critic in kept] for kept in sets]
+        values = [
+            [self._value(critic, states, action) for critic in critics_then]
+            for critics_then in sets
+        ]
         means = [
             torch.tensordot(past.share, torch.stack(of_critic), dims=1)
             for of_critic in zip(*values, strict=True)

@@ -16,23 +16,18 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class FlatGroup:
-    """Parameters of a group of an optimizer as views of one tensor, ``[P]``.
-
-    Args:
-        group: The optimizer's group.
-        target_of: Target parameters by the identity of the parameters that they follow.
-    """
+    """Parameters of an optimizer's group and targets of some, as views of one tensor, ``[P]``."""
 
     def __init__(self, group: dict[str, Any], target_of: Mapping[int, Tensor]) -> None:
         self.group = group
         # Those with a target are first, so that all targets are one tensor, too.
-        order = sorted(group["params"], key=lambda each: id(each) not in target_of)
+        order = sorted(group["params"], key=lambda parameter: id(parameter) not in target_of)
         self.parameters: list[Tensor] = order
-        self.followed = [each for each in order if id(each) in target_of]
-        targets = [target_of[id(each)] for each in self.followed]
+        self.followed = [parameter for parameter in order if id(parameter) in target_of]
+        targets = [target_of[id(parameter)] for parameter in self.followed]
         self.values, self.targets = _as_views(order), _as_views(targets)
-        self._held = [*order, *targets]
-        self._addresses = [each.data_ptr() for each in self._held]
+        self._views = [*order, *targets]
+        self._addresses = [view.data_ptr() for view in self._views]
         self.count = 0
         """Steps taken."""
         self.moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
@@ -48,7 +43,7 @@ class FlatGroup:
 
     def holds(self) -> bool:
         """Return True if the parameters and their targets are still views."""
-        return [each.data_ptr() for each in self._held] == self._addresses
+        return [view.data_ptr() for view in self._views] == self._addresses
 
     def tensors(self) -> list[Tensor]:
         """Return all that a recorded step reads or changes."""
@@ -56,24 +51,23 @@ class FlatGroup:
 
     def take_moments(self, state: Any) -> bool:
         """Have an optimizer's state view the moments; return False if it is none of one group."""
-        own = [state[each] for each in self.parameters if each in state]
-        steps = {float(each["step"]) for each in own}
-        if own and (len(own) < len(self.parameters) or len(steps) > 1):
+        states = [state[parameter] for parameter in self.parameters if parameter in state]
+        counts = {float(entry["step"]) for entry in states} or {0.0}
+        if len(states) not in (0, len(self.parameters)) or len(counts) > 1:
             return False
         for moment, key in zip(self.moments, _MOMENTS, strict=True):
             # What is read may be a view of what is written.
-            moment.copy_(
-                torch.cat([each[key].reshape(-1) for each in own])
-            ) if own else moment.zero_()
-        self.count = int(steps.pop()) if steps else 0
+            parts = [entry[key].reshape(-1) for entry in states]
+            moment.copy_(torch.cat(parts) if parts else torch.zeros_like(moment))
+        self.count = int(counts.pop())
         self._steps.fill_(self.count)
-        if own:
+        if states:
             self._give_moments(state)
         self.ready = True
         return True
 
     def _give_moments(self, state: Any) -> None:
-        views = zip(*(_views(each, self.parameters) for each in self.moments), strict=True)
+        views = zip(*(_views(moment, self.parameters) for moment in self.moments), strict=True)
         for parameter, step, pair in zip(self.parameters, self._steps, views, strict=True):
             state[parameter] = {"step": step, **dict(zip(_MOMENTS, pair, strict=True))}
 
@@ -117,20 +111,16 @@ class FlatGroup:
         mean = torch.lerp(self.moments[0], gradient, 1.0 - beta)
         square = beta_of_square * self.moments[1] + (1.0 - beta_of_square) * gradient * gradient
         values = self.values - size * mean / (square.sqrt() / root + self.group["eps"])
-        kept, moved = (*self.moments, self.values, self._steps), (mean, square, values)
-        for old, new in zip(kept, (*moved, self._steps + 1), strict=True):
+        state, moved = (*self.moments, self.values, self._steps), (mean, square, values)
+        for old, new in zip(state, (*moved, self._steps + 1), strict=True):
             old.copy_(torch.where(finite, new, old))
 
     def _gradient(self) -> Tensor:
-        return torch.cat([each.grad.reshape(-1) for each in self.parameters])  # type: ignore[union-attr]
+        return torch.cat([parameter.grad.reshape(-1) for parameter in self.parameters])  # type: ignore[union-attr]
 
 
 class FlatAdam(torch.optim.Adam):
-    """Adam, one call for each group of parameters; its states are those of PyTorch's.
-
-    Args:
-        groups: Groups of parameters, each of one type and on one device.
-    """
+    """Adam, one call for each group of parameters; its states are those of PyTorch's."""
 
     flat_groups: tuple[FlatGroup, ...] = ()
 
@@ -138,32 +128,28 @@ class FlatAdam(torch.optim.Adam):
         super().__init__(groups, fused=True)
 
     def flatten(self, target_of: Mapping[int, Tensor]) -> None:
-        """Make parameters, and the targets that follow them, views of one tensor a group.
-
-        Args:
-            target_of: Target parameters by the identity of the parameters that they follow.
-        """
+        """Make parameters, and the targets by identity of what they follow, views of one tensor."""
         self.flat_groups = ()
         if all(_alike(group["params"]) for group in self.param_groups):
-            self.flat_groups = tuple(FlatGroup(each, target_of) for each in self.param_groups)
+            self.flat_groups = tuple(FlatGroup(group, target_of) for group in self.param_groups)
 
     def holds(self) -> bool:
         """Return True if the parameters are still views, as :meth:`flatten` has made them."""
-        return all(each.holds() for each in self.flat_groups)
+        return all(flat.holds() for flat in self.flat_groups)
 
     def is_flat(self) -> bool:
         """Return True if groups can be moved by a call each; take their moments if they must be."""
         return bool(self.flat_groups) and all(
-            (each.ready or each.take_moments(self.state))
-            and not (each.group["amsgrad"] or each.group["maximize"])
-            for each in self.flat_groups
+            (flat.ready or flat.take_moments(self.state))
+            and not (flat.group["amsgrad"] or flat.group["maximize"])
+            for flat in self.flat_groups
         )
 
     def due_groups(self) -> list[FlatGroup] | None:
         """Return the groups with gradients; None if only a part of one has them."""
         due = []
         for flat in self.flat_groups:
-            missing = [each.grad is None for each in flat.parameters]
+            missing = [parameter.grad is None for parameter in flat.parameters]
             if any(missing) and not all(missing):
                 return None
             if not any(missing):
@@ -199,7 +185,7 @@ def _as_views(tensors: list[Tensor]) -> Tensor:
     """Join tensors in one, ``[P]``, of which each is a view from now on."""
     if not tensors:
         return torch.empty(0)
-    flat = torch.cat([each.detach().reshape(-1) for each in tensors])
+    flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
     for tensor, view in zip(tensors, _views(flat, tensors), strict=True):
         tensor.data = view
     return flat
@@ -208,10 +194,10 @@ def _as_views(tensors: list[Tensor]) -> Tensor:
 def _views(flat: Tensor, tensors: Iterable[Tensor]) -> list[Tensor]:
     """Return views of a tensor ``[P]`` in the shapes of these tensors."""
     tensors = list(tensors)
-    parts = flat.split([each.numel() for each in tensors])
-    return [part.view(each.shape) for part, each in zip(parts, tensors, strict=True)]
+    parts = flat.split([tensor.numel() for tensor in tensors])
+    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 def _alike(tensors: list[Tensor]) -> bool:
     """Return True if tensors have one type and one device."""
-    return len({(each.dtype, each.device) for each in tensors}) == 1
+    return len({(tensor.dtype, tensor.device) for tensor in tensors}) == 1

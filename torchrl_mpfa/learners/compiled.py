@@ -88,54 +88,43 @@ class CompiledUpdate:
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> Step | None:
-        """Make an update like losses, backward pass and steps do, and write signals in the batch.
-
-        Returns:
-            None if the update cannot be recorded.
-        """
+        """Make an update and write signals in the batch; None if it cannot be recorded."""
         entries = self._entries(batch)
         program = self._program_for(entries, batch.batch_size[:1], trains, loss_function)
         if program is None:
             return None
-        made, signals = self._run(program, entries.values())
+        step, signals = self._run(program, entries.values())
         for key, value in zip(program.written, signals, strict=True):
             _write(batch, key, value)
-        return made
+        return step
 
     def each(
         self, rows: TensorDictBase, batch_size: int, turns: Sequence[Trains]
     ) -> Iterator[Step] | None:
-        """Make an update with each batch of rows, as so many calls, and write all signals at last.
+        """Make an update with each batch of rows ``[U * B]``, and write all signals at last.
 
-        A TensorDict is not made of each batch, which would take as long as an update by Adam.
-
-        Args:
-            rows: Batches of one size, one after the other, ``[U * B]``.
-            batch_size: ``B``.
-            turns: The networks that learn from each batch.
-
-        Returns:
-            None, before anything is done, if one of the updates cannot be recorded.
+        None, before anything is done, if one of the updates cannot be recorded.
         """
+        # A TensorDict is not made of each batch, which would take as long as an update by Adam.
         columns = {key: value.split(batch_size) for key, value in self._entries(rows).items()}
         first = {key: parts[0] for key, parts in columns.items()}
         size = torch.Size([batch_size])
-        programs = {each: self._program_for(first, size, each, None) for each in set(turns)}
+        programs = {turn: self._program_for(first, size, turn, None) for turn in set(turns)}
         if None in programs.values():
             return None
-        return self._runs(rows, columns, [programs[each] for each in turns])
+        return self._runs(rows, columns, [programs[turn] for turn in turns])
 
     def _runs(
         self, rows: TensorDictBase, columns: dict[NestedKey, Any], programs: list[Any]
     ) -> Iterator[Step]:
         """Run one program after the other; write all signals at last."""
-        found: dict[NestedKey, list[Tensor]] = {}
+        written: dict[NestedKey, list[Tensor]] = {}
         for program, *values in zip(programs, *columns.values(), strict=True):
-            made, signals = self._run(program, values)
+            step, signals = self._run(program, values)
             for key, value in zip(program.written, signals, strict=True):
-                found.setdefault(key, []).append(value)
-            yield made
-        for key, parts in found.items():
+                written.setdefault(key, []).append(value)
+            yield step
+        for key, parts in written.items():
             _write(rows, key, torch.cat(parts))
 
     def _entries(self, batch: TensorDictBase) -> Entries:
@@ -162,13 +151,12 @@ class CompiledUpdate:
         for group in program.stepped or ():
             group.scale()
         with torch.no_grad():
-            given = program.call(*values, *program.state)
-        found = iter(given)
+            outputs = iter(program.call(*values, *program.state))
         for parameter in program.moved:
-            parameter.grad = next(found)
-        signals = list(islice(found, len(program.written)))
-        log = dict(zip(program.log, found, strict=False))
-        if program.stepped is None or not next(found).item():
+            parameter.grad = next(outputs)
+        signals = list(islice(outputs, len(program.written)))
+        log = dict(zip(program.log, outputs, strict=False))
+        if program.stepped is None or not next(outputs).item():
             return Step(log, False), signals
         for group in program.stepped:
             group.count_step(self._learner.optimizer.state)
@@ -188,12 +176,12 @@ class CompiledUpdate:
     ) -> Program | None:
         learner = self._learner
         optimizer, stepped = learner.optimizer, None
-        learner.clear_gradients()
+        learner.optimizer.zero_grad()
         parameters = [value for value in learner.networks.parameters() if value.requires_grad]
         parts = learner.networks, learner.targets
         tensors = [v for part in parts for v in (*part.parameters(), *part.buffers())]
         if steps:
-            tensors += [each for group in optimizer.flat_groups for each in group.tensors()]
+            tensors += [tensor for group in optimizer.flat_groups for tensor in group.tensors()]
         moved: list[Tensor] = []
         written: Entries = {}
         log: dict[str, Tensor] = {}
@@ -204,20 +192,20 @@ class CompiledUpdate:
             with torch.enable_grad():
                 log.update(learner._differentiate(batch, trains, loss_function))
             written.update((k, v) for k, v in batch.items(True, True) if k not in entries)
-            given = [*written.values(), *(value.detach() for value in log.values())]
+            outputs = [*written.values(), *(value.detach() for value in log.values())]
             if steps:
                 stepped = optimizer.due_groups()
             if stepped is None:
-                moved.extend(each for each in parameters if each.grad is not None)
-                return [*(each.grad for each in moved), *given]  # type: ignore[list-item]
+                moved.extend(p for p in parameters if p.grad is not None)
+                return [*(p.grad for p in moved), *outputs]  # type: ignore[list-item]
             losses = [value for name, value in log.items() if name.startswith("loss")]
-            finite = torch.stack([each.detach().isfinite().all() for each in losses]).all()
+            finite = torch.stack([loss.detach().isfinite().all() for loss in losses]).all()
             with torch.no_grad():
                 for group in stepped:
                     group.record_step(finite)
                 if trains != "critic":
                     learner.record_targets(finite)
-            return [*given, finite]
+            return [*outputs, finite]
 
         # Recorded with real numbers, as a loss may make tensors that it keeps; but with none of the
         # random numbers that the update will have.
@@ -237,17 +225,17 @@ class CompiledUpdate:
         finally:
             # The steps were taken, and layers with running statistics have counted the batch.
             with torch.no_grad():
-                for value, kept in zip(tensors, before, strict=True):
-                    value.copy_(kept)
-            learner.clear_gradients()
+                for tensor, numbers in zip(tensors, before, strict=True):
+                    tensor.copy_(numbers)
+            learner.optimizer.zero_grad()
         if stepped is None:
             self._warn(
                 f"steps of the {type(optimizer).__name__} are not compiled: a program takes those "
                 "of an Adam without hooks, if all parameters of a group have gradients"
             )
-        taken = _take_state(graph_module, tensors)
-        call = self._compiled(graph_module.graph, [*entries.values(), *taken])
-        return Program(call, taken, stepped, moved, list(written), list(log))
+        state = _take_state(graph_module, tensors)
+        call = self._compiled(graph_module.graph, [*entries.values(), *state])
+        return Program(call, state, stepped, moved, list(written), list(log))
 
     def _warn(self, text: str) -> None:
         """Say once that something falls back to PyTorch's own operations."""
@@ -296,11 +284,11 @@ def _keep_programs() -> None:
     # PyTorch writes that default into the environment itself.
     if os.environ.get("TORCHINDUCTOR_CACHE_DIR") not in (None, default_cache_dir()):
         return
-    kept = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     # Processors of several kinds may share the folder.
     able = sorted(name for name, has in torch.cpu.get_capabilities().items() if has is True)
     processor = hashlib.sha256(repr(able).encode()).hexdigest()[:16]
-    folder = Path(kept, "torchrl_mpfa", "programs", processor)
+    folder = Path(cache, "torchrl_mpfa", "programs", processor)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:  # There is no home to write to: the temporary folder is what is left.
@@ -361,12 +349,12 @@ def _take_state(trace: fx.GraphModule, tensors: list[Tensor]) -> list[Tensor]:
                 last = graph.placeholder(f"state_{len(inputs)}")
             # What is no tensor of the learner was made by its loss for the trace, or is kept by it.
             inputs[place] = last, of_storage.get(place, value)
-        taken, whole = inputs[place]
-        if _view(value) != _view(whole):
+        input_node, tensor = inputs[place]
+        if _view(value) != _view(tensor):
             with graph.inserting_before(node):
-                source = taken, *_view(value)
-                taken = graph.call_function(torch.ops.aten.as_strided.default, source)
-        node.replace_all_uses_with(taken)
+                source = input_node, *_view(value)
+                input_node = graph.call_function(torch.ops.aten.as_strided.default, source)
+        node.replace_all_uses_with(input_node)
         graph.erase_node(node)
     for node in graph.nodes:
         # With what was noted of some inputs only, Inductor's C++ wrapper would miss the others.

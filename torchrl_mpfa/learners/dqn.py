@@ -15,22 +15,19 @@ from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, Optimi
 from torchrl_mpfa.losses import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import td_error_priority
-from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
+from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
 _DISTANCES = ("l1", "l2", "smooth_l1")
 
 
-def whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
-    """Return the sampled batch, which must be for actor and critic alike."""
-    sampled = as_sampled(sampled)
-    if sampled.trains != "both" or sampled.loss_function is not None:
+def reject_part(trains: Trains, loss_function: str | None, learner: object) -> None:
+    """Reject a batch for actor or critic alone, or with a loss function of its own."""
+    if trains != "both" or loss_function is not None:
         raise ValueError(
-            f"a batch for the {sampled.trains} alone, or with the loss function "
-            f"{sampled.loss_function!r}, needs actor and critic: {type(learner).__name__} has one "
-            "network for both"
+            f"a batch for the {trains} alone, or with the loss function {loss_function!r}, needs "
+            f"actor and critic: {type(learner).__name__} has one network for both"
         )
-    return sampled.batch
 
 
 class DQN(OptimizedLearner):
@@ -38,7 +35,8 @@ class DQN(OptimizedLearner):
 
     A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|`, shape ``[B]``. There is no signal
     of Eq. (14): a choice among actions has no slope. The loss is Eq. (11),
-    :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2`.
+    :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2`. Actions of a batch are one-hot,
+    ``[B, K]``, or numbers, ``[B, 1]``. A batch is for all networks: none for the critic alone.
 
     Args:
         network: From observations to ``"action_value"`` and a one-hot ``"action"``, such as
@@ -106,26 +104,10 @@ class DQN(OptimizedLearner):
         super().__init__(networks, targets, groups, optimizer, tau)
         self.policy: DirectModule = network
 
-    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
-        """Step the network and the target network.
-
-        Args:
-            sampled: The batch; one of size ``[B]`` stands for ``SampledBatch(batch)``. It gets the
-                signal of Eq. (13). Actions are one-hot, ``[B, K]``, or numbers, ``[B, 1]``.
-
-        Returns:
-            Detached values for the log.
-
-        Raises:
-            KeyError: If the batch lacks an entry.
-            ValueError: If the loss is not finite, the actions have neither form, or the batch is
-                for an actor or critic alone; nothing is changed then.
-        """
-        return super().update(whole_batch(sampled, self))
-
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
+        reject_part(trains, loss_function, self)
         online, target = self.policy, self.targets["value"]
         states, after = self._states_of(batch), self._states_of(batch["next"])
         values = online.outputs(states)["action_value"]

@@ -109,8 +109,8 @@ class PastCritics(nn.Module):
     def push(self, critics: nn.ModuleList) -> None:
         """Replace the oldest state by the critics' present one."""
         oldest = self.states[int(self.taken) % len(self.states)]
-        for kept, value in zip(oldest.parameters(), critics.parameters(), strict=True):
-            kept.copy_(value)
+        for old, value in zip(oldest.parameters(), critics.parameters(), strict=True):
+            old.copy_(value)
         self.taken += 1
         count = min(int(self.taken), len(self.states))
         self.share.zero_()

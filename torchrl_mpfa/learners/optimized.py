@@ -7,7 +7,9 @@ learner has the same methods and takes its place.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
@@ -17,8 +19,8 @@ from torch import Tensor, nn
 
 from torchrl_mpfa.checks import ABOVE_ZERO, SHARE, Rule, check
 from torchrl_mpfa.learners.adam import FlatAdam
-from torchrl_mpfa.learners.checks import check_alike, check_losses, fits_loss
 from torchrl_mpfa.learners.compiled import CompiledUpdate, Step
+from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
 
 OptimizerName = Literal["adam", "radam"]
@@ -67,14 +69,7 @@ class OptimizedLearner:
     r"""Networks, targets that follow them, and one optimizer whose rates can be lowered.
 
     Targets follow by :math:`\theta' \leftarrow \tau\theta + (1 - \tau)\theta'` (Eqs. 6-7). A copy
-    shares nothing with the learner.
-
-    Args:
-        networks: Networks by name.
-        targets: Copies of networks by the same names.
-        groups: Groups of parameters for the optimizer.
-        optimizer: ``"adam"`` or ``"radam"``.
-        tau: :math:`\tau`.
+    shares nothing with the learner. ``groups`` are those of the optimizer's parameters.
     """
 
     policy_delay = 1
@@ -106,10 +101,10 @@ class OptimizedLearner:
         pairs: list[Any] = list(zip(online, self.targets.parameters(), strict=True))
         flat = []
         if isinstance(self.optimizer, FlatAdam):
-            self.optimizer.flatten({id(own): target for own, target in pairs})
+            self.optimizer.flatten({id(parameter): target for parameter, target in pairs})
             flat = [group for group in self.optimizer.flat_groups if group.followed]
-        done = {id(own) for group in flat for own in group.followed}
-        pairs = [pair for pair in pairs if id(pair[0]) not in done]
+        in_group = {id(parameter) for group in flat for parameter in group.followed}
+        pairs = [pair for pair in pairs if id(pair[0]) not in in_group]
         pairs += [(group.values[: len(group.targets)], group.targets) for group in flat]
         self._online, self._followers = map(list, zip(*pairs, strict=True))
         if self._program is not None:
@@ -135,7 +130,7 @@ class OptimizedLearner:
         """
         sampled = as_sampled(sampled)
         updates = self.updates + sampled.new_step
-        trains, due = sampled.trains, self._is_due(updates)
+        trains, due = sampled.trains, updates % self.policy_delay == 0
         if trains == "both" and not due:
             trains = "critic"
         log: dict[str, Tensor] = {}
@@ -145,27 +140,17 @@ class OptimizedLearner:
         return log
 
     def update_each(self, rows: TensorDictBase, batches: int) -> dict[str, Tensor] | None:
-        """Make an update with each batch of rows by the compiled program, and write their signals.
+        """Make an update with each of ``U`` batches, ``[U * B]``, by the compiled program.
 
-        Args:
-            rows: Batches of one size, one after the other, ``[U * B]``.
-            batches: ``U``.
-
-        Returns:
-            The log of the last update; None, before anything is done, without a program or with an
-            ``update`` of one's own.
-
-        Raises:
-            KeyError: As :meth:`update`.
-            RuntimeError: As :meth:`update`.
-            ValueError: As :meth:`update`, of whose kind the earlier ones were made.
+        Return the log of the last one; None, before anything is done, without a program or where
+        ``update`` is overridden. An error leaves the updates before its batch made.
         """
-        own = getattr(self.update, "__func__", None) is not OptimizedLearner.update
-        if self._program is None or own:
+        overridden = getattr(self.update, "__func__", None) is not OptimizedLearner.update
+        if self._program is None or overridden:
             return None
         self._follow_parameters()
         counts = range(self.updates + 1, self.updates + 1 + batches)
-        turns: list[Trains] = ["both" if self._is_due(number) else "critic" for number in counts]
+        turns: list[Trains] = ["critic" if n % self.policy_delay else "both" for n in counts]
         size = len(rows) // batches
         with fits_loss(rows):
             steps = self._program.each(rows, size, turns)
@@ -177,10 +162,6 @@ class OptimizedLearner:
             self.updates += 1
         return step.log
 
-    def _is_due(self, update: int) -> bool:
-        """Return True if an update of this number is one of the actor and the targets as well."""
-        return update % self.policy_delay == 0
-
     def _step(
         self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
     ) -> dict[str, Tensor]:
@@ -189,7 +170,7 @@ class OptimizedLearner:
         with fits_loss(batch):
             step = None if self._program is None else self._program(batch, trains, loss_function)
             if step is None:
-                self.clear_gradients()
+                self.optimizer.zero_grad()
                 step = Step(self._differentiate(batch, trains, loss_function), False)
         if not step.taken:
             self._take_step(step.log, batch, trains)
@@ -228,12 +209,6 @@ class OptimizedLearner:
         for target, online in zip(self._followers, self._online, strict=True):
             moved = torch.lerp(target, online, self._rounded_tau)
             target.copy_(torch.where(finite, moved, target))
-
-    def clear_gradients(self) -> None:
-        """Let no parameter have a gradient."""
-        for group in self.optimizer.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
 
     def end_episode(self) -> None:
         """Change nothing."""
@@ -303,3 +278,85 @@ def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.o
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
+
+
+# What is wrong with a batch, a loss or a saved state, and where.
+
+
+@contextmanager
+def fits_loss(batch: TensorDictBase) -> Iterator[None]:
+    """Say of which form a batch is that does not fit the loss."""
+    try:
+        yield
+    except RuntimeError as error:
+        if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
+            raise
+        entries = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
+        forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in entries)
+        raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
+
+
+def check_losses(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:
+    """Raise if a value whose name begins with ``"loss"`` is not finite, with entry and row."""
+    # One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
+    # as that is one number for each.
+    for name, value in losses.items():
+        if not name.startswith("loss"):
+            continue
+        if math.isfinite(value.item()) if value.ndim == 0 else bool(value.isfinite().all()):
+            continue
+        cause = _first_not_finite(batch)
+        if cause is not None:
+            raise ValueError(f"batch must be finite, got {cause}")
+        raise ValueError(
+            f"{name} must be finite, got {value.sum().item()} of a finite batch: lower the "
+            "learning rate, or scale the rewards"
+        )
+
+
+def _first_not_finite(batch: TensorDictBase) -> str | None:
+    """Describe the first number of a batch that is not finite, but for the signals."""
+    for key, value in batch.items(True, True):
+        written = key[0] if isinstance(key, tuple) else key
+        if written in {"signals", "td_error"} or not torch.is_floating_point(value):
+            continue
+        rows = (~value.isfinite()).reshape(len(value), -1)
+        if bool(rows.any()):
+            row = int(rows.any(1).nonzero()[0])
+            number = value[row].reshape(-1)[rows[row]][0].item()
+            return f"{number} in {key!r}, row {row}"
+    return None
+
+
+def check_alike(part: str, state: Any, like: Any) -> None:
+    """Raise unless a saved state has entries, types and sizes like another, all finite."""
+    _check_form(f"the saved {part}", state, like)
+    check_saved_numbers(part, state)
+
+
+def _check_form(place: str, state: Any, like: Any) -> None:
+    if isinstance(like, Tensor) and isinstance(state, Tensor):
+        # PyTorch keeps a count in the default type of the process that began.
+        if state.shape != like.shape or (state.dtype is not like.dtype and like.ndim):
+            raise ValueError(f"{place} must be {_form(like)}, got {_form(state)}")
+    elif isinstance(like, Mapping) and isinstance(state, Mapping):
+        # The moments of an optimizer come with the first gradient of a parameter.
+        missing = [] if place.endswith("'state'") else [key for key in like if key not in state]
+        if unfit := [*missing, *(key for key in state if key not in like)]:
+            word = "lacks" if missing else "must not have"
+            raise ValueError(f"{place} {word} {unfit[0]!r}")
+        for key, value in state.items():
+            _check_form(f"{place}, {key!r}", value, like[key])
+    elif isinstance(like, list) and isinstance(state, list) and len(like) == len(state):
+        for number, pair in enumerate(zip(state, like, strict=True)):
+            _check_form(f"{place}, {number}", *pair)
+    elif type(state) is not type(like) or isinstance(like, list):
+        raise ValueError(f"{place} must be {_form(like)}, got {_form(state)}")
+
+
+def _form(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{value.dtype} of shape {[*value.shape]}"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return f"a list of {len(value)}" if isinstance(value, list) else repr(value)

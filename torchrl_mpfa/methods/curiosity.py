@@ -17,15 +17,15 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.learners.checks import check_losses
+from torchrl_mpfa.learners.optimized import check_losses
 
 
-def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
+def intrinsic_reward(foreseen: Tensor, features: Tensor, *, scale: float) -> Tensor:
     r"""Compute the bonus :math:`\tfrac{\eta}{2} \lVert \hat\phi' - \phi' \rVert^2`.
 
     Args:
         foreseen: Features that the forward model predicts, shape ``[B, F]``.
-        found: Features of the next observation, shape ``[B, F]``.
+        features: Features of the next observation, shape ``[B, F]``.
         scale: :math:`\eta`.
 
     Returns:
@@ -35,7 +35,7 @@ def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor
         >>> intrinsic_reward(torch.zeros(1, 2), torch.ones(1, 2), scale=0.5).tolist()
         [0.5]
     """
-    return 0.5 * scale * (foreseen - found).square().sum(-1)
+    return 0.5 * scale * (foreseen - features).square().sum(-1)
 
 
 def _network(*sizes: int) -> nn.Sequential:

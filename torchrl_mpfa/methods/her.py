@@ -88,8 +88,8 @@ class HindsightGoals(Transform):
         ...     def __call__(self, episode, steps):
         ...         goals = episode["place"][steps]
         ...         rows = [episode[: step + 1].clone() for step in steps]
-        ...         for each, goal in zip(rows, goals):
-        ...             each["goal"] = goal.expand(len(each), 1)
+        ...         for steps, goal in zip(rows, goals):
+        ...             steps["goal"] = goal.expand(len(steps), 1)
         ...         return torch.cat(rows).exclude("place")
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100))
         >>> goals = HindsightGoals(ReachPlace(), goals=3)

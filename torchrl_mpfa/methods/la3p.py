@@ -170,7 +170,7 @@ def uniform_halves(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         >>> from torchrl.data import LazyTensorStorage
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=8)
         >>> index = buffer.extend(TensorDict({"reward": torch.rand(10)}, [10]))
-        >>> [len(each.batch) for each in uniform_halves(buffer)]
+        >>> [len(sampled.batch) for sampled in uniform_halves(buffer)]
         [4, 4]
     """
     batch = buffer.sample()

@@ -41,8 +41,6 @@ _LEAST = 1e-3
 """With a reliability of zero a transition would be lost for good."""
 _UNDER_WAY = 1024
 """Episodes that may continue; of more, those that were written last."""
-_SPARSE = 8
-"""Up to so many numbers for each transition, those of the episodes serve as places in a table."""
 
 
 def reliability(
@@ -197,7 +195,8 @@ class ReaPERSampler(SignalSampler):
         # One at a time, which is much faster than by a list.
         errors, last, time = (table.rows[: table.size, c].contiguous() for c in columns)
         errors = torch.where(errors.isnan(), priority - self._eps, errors)
-        numbers = _numbers(self._episodes[: table.size])
+        # From 0: they are places in a table.
+        numbers = self._episodes[: table.size] - self._episodes[: table.size].min()
         sums = torch.bincount(numbers, weights=errors)
         ended, touched = torch.zeros(2, len(sums), dtype=torch.bool, device=sums.device)
         ended[numbers[last.nonzero().squeeze(1)]] = True
@@ -215,12 +214,3 @@ class ReaPERSampler(SignalSampler):
         super()._retransform_priority_trees(old_alpha, new_alpha)
         if self.table.size:
             self._rely(self.table, torch.arange(self.table.size, device=self.device))
-
-
-def _numbers(episode: Tensor) -> Tensor:
-    """Episodes numbered from 0, with gaps, shape ``[N]``."""
-    lowest = episode.min()
-    number = (episode - lowest).long()
-    if bool((number + lowest == episode).all()) and int(number.max()) < _SPARSE * len(number):
-        return number
-    return torch.unique(episode, return_inverse=True)[1]

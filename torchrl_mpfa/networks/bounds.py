@@ -20,11 +20,10 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
         >>> low.tolist(), high.tolist()
         ([-2.0], [2.0])
     """
-    given = action_spec
     if isinstance(action_spec, Composite):
         leaves = list(action_spec.values(include_nested=True, leaves_only=True))
         if len(leaves) != 1:
-            raise ValueError(f"action_spec must have one entry, got {len(leaves)}: {given}")
+            raise ValueError(f"action_spec must have one entry, got {len(leaves)}: {action_spec}")
         (action_spec,) = leaves
     if not isinstance(action_spec, Bounded):
         raise ValueError(f"action_spec must be Bounded, got {type(action_spec).__name__}")
@@ -40,12 +39,7 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
     if not all(bool((row == row[:1]).all()) for row in rows):
         raise ValueError("action_spec must have the same bounds for all environments of a batch")
     low, high = (row[0].float().clone() for row in rows)
-    if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
-        raise ValueError(
-            f"action_spec must have finite bounds, low < high, got {low.tolist()} and "
-            f"{high.tolist()}"
-        )
-    return low, high
+    return _checked("action_spec must have finite bounds", low, high)
 
 
 def given_bounds(bounds: Any) -> tuple[Tensor, Tensor]:
@@ -54,9 +48,13 @@ def given_bounds(bounds: Any) -> tuple[Tensor, Tensor]:
         return action_bounds(bounds)
     if bounds is None:
         raise ValueError("bounds must be an action spec, or least and greatest action, got None")
-    low, high = map(torch.as_tensor, bounds)
+    return _checked("bounds must be finite", *map(torch.as_tensor, bounds))
+
+
+def _checked(wanted: str, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Return bounds that are finite and in order."""
     if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
-        raise ValueError(f"bounds must be finite, low < high, got {bounds}")
+        raise ValueError(f"{wanted}, low < high, got {low.tolist()} and {high.tolist()}")
     return low, high
 
 

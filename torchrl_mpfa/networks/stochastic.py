@@ -180,8 +180,8 @@ def make_stochastic_actor(
     Examples:
         >>> policy = make_stochastic_actor(24, 2)
         >>> from tensordict import TensorDict
-        >>> found = policy(TensorDict({"observation": torch.rand(5, 24)}, [5]))
-        >>> torch.allclose(found["action"], found["preactivation"].tanh())
+        >>> outputs = policy(TensorDict({"observation": torch.rand(5, 24)}, [5]))
+        >>> torch.allclose(outputs["action"], outputs["preactivation"].tanh())
         True
     """
     check_counts(observation_size=observation_size, action_size=action_size)

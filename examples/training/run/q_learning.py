@@ -10,12 +10,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import ABOVE_ZERO, SHARE, check, check_counts
-from torchrl_mpfa.learners.checks import check_alike, check_losses
-from torchrl_mpfa.learners.dqn import whole_batch
+from torchrl_mpfa.learners.dqn import reject_part
+from torchrl_mpfa.learners.optimized import check_alike, check_losses
 from torchrl_mpfa.losses import read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.deterministic import OUT_KEYS, with_best
-from torchrl_mpfa.selection import SampledBatch
+from torchrl_mpfa.selection import SampledBatch, as_sampled
 from torchrl_mpfa.signals import TD_ERROR
 
 
@@ -117,7 +117,7 @@ class TabularQLearner:
         """Move the entries that the transitions of a batch belong to.
 
         Args:
-            sampled: As in :meth:`torchrl_mpfa.DQN.update`; actions are one-hot or numbers.
+            sampled: The batch; actions are one-hot, ``[B, K]``, or numbers.
 
         Returns:
             Values for the log.
@@ -127,7 +127,9 @@ class TabularQLearner:
             ValueError: If a number is not finite, the actions have neither form, or the batch is
                 for an actor or critic alone; nothing is changed then.
         """
-        batch = whole_batch(sampled, self)
+        sampled = as_sampled(sampled)
+        reject_part(sampled.trains, sampled.loss_function, self)
+        batch = sampled.batch
         cell_of, table = self.policy.module.cell_of, self.table
         action = read_choices(batch["action"], table.shape[1], batch)
         entry = cell_of(batch["observation"]) * table.shape[1] + action
