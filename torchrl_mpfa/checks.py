@@ -166,7 +166,7 @@ def as_mask(name: str, value: Any) -> Tensor:
     return value != 0
 
 
-def check_finite(name: str, value: Tensor) -> None:
+def check_not_negative(name: str, value: Tensor) -> None:
     """Reject values that are negative or not finite, naming the first."""
     wrong = ~((value >= 0) & (value < math.inf))
     if bool(wrong.any()):

@@ -43,7 +43,7 @@ from torchrl_mpfa.checks import (
     NOT_NEGATIVE,
     Rule,
     check,
-    check_finite,
+    check_not_negative,
     check_shape,
     keep,
     kind_of,
@@ -235,7 +235,7 @@ def checked_weights(
     """Return the checked weights of a fusion, in double precision, shape ``[K]``."""
     name = "weights of the fusion"
     weights = check_shape(name, fusion.weights(names, table, index), (len(names),))
-    check_finite(name, weights)
+    check_not_negative(name, weights)
     return weights.to(table.rows.device, torch.double)
 
 

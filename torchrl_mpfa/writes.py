@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 
-from torchrl_mpfa.checks import check_finite
+from torchrl_mpfa.checks import check_not_negative
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalTensorStorage, slots_of
@@ -130,7 +130,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         if by_priority and prioritizes and not (real and priority.numel() == shape.numel()):
             form = f"{priority.dtype} of shape {[*priority.shape]}" if real else type(priority)
             raise ValueError(f"{name} must be one real number for each of {[*shape]}, got {form}")
-        check_finite(name, priority)
+        check_not_negative(name, priority)
         if prioritizes and hasattr(self._sampler, "check_priority"):
             self._sampler.check_priority(priority)
         if not by_priority:

@@ -18,8 +18,8 @@ from torchrl_mpfa.checks import (
     NOT_NEGATIVE,
     check,
     check_counts,
-    check_finite,
     check_index,
+    check_not_negative,
     check_shape,
     kind_of,
     unknown,
@@ -416,8 +416,8 @@ class SignalSampler(TreeSampler):
                 f"{sorted(state['_weights'])}"
             )
         weights, mean = self._ordered(state["_weights"]), torch.tensor(state["_mean_reward"])
-        check_finite("'_weights' of the saved sampler", weights)
-        check_finite("mean reward of the saved sampler", mean.abs())
+        check_not_negative("'_weights' of the saved sampler", weights)
+        check_not_negative("mean reward of the saved sampler", mean.abs())
         self._weighing = Weighing(
             weights,
             state["_mean_reward"],

@@ -14,8 +14,8 @@ from torchrl_mpfa.checks import (
     bounds,
     check,
     check_counts,
-    check_finite,
     check_index,
+    check_not_negative,
     generator_on,
     seeded_generator,
 )
@@ -387,7 +387,7 @@ class TreeSampler(SavedTrees):
         if len(stored) == 0:
             return
         value = value if len(stored) == len(slots) else value[slots >= 0]
-        check_finite("priority", value)
+        check_not_negative("priority", value)
         highest = self._checked(value + self._eps)
         if (last := last_of_each(stored)) is not None:
             stored, value = stored[last], value[last]
@@ -400,7 +400,7 @@ class TreeSampler(SavedTrees):
 
     def check_priority(self, priority: Tensor) -> None:
         """Reject priorities of new transitions, before eps, as :meth:`update_priority`."""
-        check_finite("priority", priority)
+        check_not_negative("priority", priority)
         self._checked(priority.to(torch.double) + self._eps)
 
     def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
@@ -416,7 +416,7 @@ class TreeSampler(SavedTrees):
         """Return the highest of priorities, eps included; reject those that poison a tree."""
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
-            check_finite(name, priority)
+            check_not_negative(name, priority)
         self._positive &= low > 0 and self._alpha * math.log(low) > _LOG_POSITIVE
         if high > 0 and self._alpha * math.log(high) + math.log(self._max_capacity) > _LOG_LARGEST:
             raise ValueError(f"priority must not be so high that sums overflow, got {high}")

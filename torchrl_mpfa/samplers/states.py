@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_not_negative
 from torchrl_mpfa.samplers.trees import leaves_of, set_leaves
 from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
 
@@ -114,12 +114,12 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
         check(NOT_NEGATIVE, alpha=self._alpha, beta=self._beta, eps=self._eps)
         # NaN where nothing was written, and there trees are left as they are made.
         slots = (~self._priorities.isnan()).nonzero().squeeze(1)
-        check_finite("'_priorities' of the saved sampler", self._priorities[slots])
+        check_not_negative("'_priorities' of the saved sampler", self._priorities[slots])
         learned = alike("_learned", state["_learned"], self._priorities.isnan())[slots]
         for name in ("_sum_tree", "_min_tree"):
             leaf = alike(name, state[name], self._priorities)[slots]
             # A leaf of what cannot be sampled is infinite among the lowest.
-            check_finite(f"{name!r} of the saved sampler", leaf.where(leaf != math.inf, 0.0))
+            check_not_negative(f"{name!r} of the saved sampler", leaf.where(leaf != math.inf, 0.0))
             if len(slots):
                 set_leaves(slots, leaf, getattr(self, name))
         if not bool(self._sum_tree.query(0, size) < math.inf):

@@ -18,8 +18,8 @@ from torchrl_mpfa.checks import (
     bounds,
     check,
     check_counts,
-    check_finite,
     check_index,
+    check_not_negative,
     check_shape,
 )
 from torchrl_mpfa.saving import check_saved
@@ -175,7 +175,7 @@ class SignalTable:
         for name, value in zip(self.names, chosen.unbind(1), strict=False):
             if name in written and bool(value.isnan().any()):
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
-            check_finite(f"signal {name!r}", value)
+            check_not_negative(f"signal {name!r}", value)
 
     def live_rows(
         self, slots: Tensor, written_at: Tensor | None, batches: int
@@ -295,9 +295,9 @@ class SignalTable:
         # NaN stands for what is not known yet.
         numbers = rows[:, : self.count_column].clone()
         numbers[:, self.reward_column].abs_()
-        check_finite("signals and rewards of the saved signals", numbers[~numbers.isnan()])
+        check_not_negative("signals and rewards of the saved signals", numbers[~numbers.isnan()])
         rest = rows[:, self.count_column :]
-        check_finite("counts and times of the saved signals", rest)
+        check_not_negative("counts and times of the saved signals", rest)
         if len(rest) and (latest := rest[:, -1].max().item()) >= state["writes"]:
             raise ValueError(
                 f"times of the saved signals must be below {state['writes']}, got {latest}"
@@ -327,5 +327,5 @@ def _written_priority(signal: Signal, value: Tensor) -> Tensor:
     priority = _priority(signal, value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):
-        check_finite(f"signal {signal.name!r}", priority)
+        check_not_negative(f"signal {signal.name!r}", priority)
     return priority

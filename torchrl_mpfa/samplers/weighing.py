@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_finite
+from torchrl_mpfa.checks import check_not_negative
 from torchrl_mpfa.fusion import checked_weights
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _count(sampler: SignalSampler, batch_size: int, weighing: Weighing) -> Weigh
     ]
     for value in counted:
         if value is not None:
-            check_finite("what an adjustment counted", value)
+            check_not_negative("what an adjustment counted", value)
     return replace(
         weighing,
         counted=tuple(counted),
