@@ -62,6 +62,7 @@ class TransformMemory:
         for part in parts:
             if part not in self._first:
                 _warn_of_steps_past_the_end(part)
+                self._first[part] = {}
         before = {part: _attributes(part) for part in parts}
         copies, random = self.copies(), torch.get_rng_state()
         sources = [v for values in before.values() for v in values.values()]
@@ -70,7 +71,9 @@ class TransformMemory:
         try:
             # A copy: the caller may write into its own again.
             rows = self._transform.inv(_with_masks(data.clone(), parts))
-            self._check_kept(before)
+            for _, _, value in _changes(before):
+                for waiting in _rows(value):
+                    check_finite_entries(waiting, waiting.ndim, self._allowed)
             yield rows
         except BaseException:
             self.set_back(copies)
@@ -78,19 +81,8 @@ class TransformMemory:
             for source, state in zip(sources, states, strict=True):
                 source.set_state(state)
             raise
-        for part, attributes in before.items():
-            first = self._first.setdefault(part, {})
-            for name, value in _attributes(part).items():
-                if value is not attributes.get(name) or _is_written_in(value):
-                    first.setdefault(name, copies[part].get(name))
-
-    def _check_kept(self, before: dict[nn.Module, _Attributes]) -> None:
-        """Reject transitions that a part keeps since a write and that are not finite."""
-        for part, attributes in before.items():
-            for name, value in _attributes(part).items():
-                if value is not attributes.get(name) or _is_written_in(value):
-                    for rows in _rows(value):
-                        check_finite_entries(rows, rows.ndim, self._allowed)
+        for part, name, _ in _changes(before):
+            self._first[part].setdefault(name, copies[part].get(name))
 
     def set_back(self, copies: dict[nn.Module, _Attributes]) -> None:
         """Give modules the attributes that they had when these were copied."""
@@ -142,6 +134,14 @@ def _with_masks(data: Any, parts: Sequence[nn.Module]) -> Any:
 def _attributes(part: nn.Module) -> _Attributes:
     attributes = {name: value for name, value in vars(part).items() if name not in _OF_EVERY_MODULE}
     return {**attributes, **part._buffers}
+
+
+def _changes(before: dict[nn.Module, _Attributes]) -> Iterator[tuple[nn.Module, str, Any]]:
+    """Yield what a write has changed, or may have changed in its place: module, name and value."""
+    for part, attributes in before.items():
+        for name, value in _attributes(part).items():
+            if value is not attributes.get(name) or _is_written_in(value):
+                yield part, name, value
 
 
 def _is_written_in(value: Any) -> bool:

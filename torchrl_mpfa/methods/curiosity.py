@@ -108,18 +108,6 @@ class Curiosity(nn.Module):
         self.forward_model = _network(features + action_size, width, features)
         self.optimizer = torch.optim.RAdam(self.parameters(), lr=lr)
 
-    def bonus(self, observation: Tensor, action: Tensor, after: Tensor) -> Tensor:
-        """Compute the bonus of transitions by the present models, shape ``[B]``.
-
-        Args:
-            observation: Shape ``[B, O]``.
-            action: Shape ``[B, A]``.
-            after: The next observation, shape ``[B, O]``.
-        """
-        with torch.no_grad():
-            foreseen = self.forward_model(torch.cat((self.encoder(observation), action), -1))
-            return intrinsic_reward(foreseen, self.encoder(after), scale=self.scale)
-
     def forward(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Add the bonus to a batch, and take one step of the models.
 
@@ -133,34 +121,29 @@ class Curiosity(nn.Module):
             KeyError: If the batch lacks an entry.
             ValueError: If a number of it is not finite; nothing is changed then.
         """
-        observation, action = batch["observation"], batch["action"]
-        following = batch["next"]
-        after, reward = following["observation"], following[self.reward_key]
-        bonus = self.bonus(observation, action, after).reshape(reward.shape).to(reward.dtype)
-        losses = self._losses(observation, action, after)
+        action, following = batch["action"], batch["next"]
+        reward = following[self.reward_key]
+        before, then = self.encoder(batch["observation"]), self.encoder(following["observation"])
+        inferred = self.inverse_model(torch.cat((before, then), -1))
+        foreseen = self.forward_model(torch.cat((before, action), -1))
+        inverse_loss = (inferred - action).square().sum(-1).mean()
+        forward_loss = intrinsic_reward(foreseen, then, scale=1.0).mean()
+        bonus = intrinsic_reward(foreseen, then, scale=self.scale).detach()
+        bonus = bonus.reshape(reward.shape).to(reward.dtype)
+        losses = {"loss_inverse": inverse_loss, "loss_forward": forward_loss}
         check_losses({"loss_reward": reward + bonus, **losses}, batch)
-        self._learn(losses)
+        self.optimizer.zero_grad()
+        # The features learn from both.
+        ((1.0 - self.forward_share) * inverse_loss + self.forward_share * forward_loss).backward()
+        self.optimizer.step()
         following.set("extrinsic_reward", reward)
         following.set("intrinsic_reward", bonus)
         following.set(self.reward_key, reward + bonus)
-        log = {f"{name}_loss": losses[f"loss_{name}"].detach() for name in ("inverse", "forward")}
-        return {**log, "intrinsic_reward": bonus}
-
-    def _losses(self, observation: Tensor, action: Tensor, after: Tensor) -> dict[str, Tensor]:
-        """Compute the losses of both models, from both of which the features learn."""
-        before, then = self.encoder(observation), self.encoder(after)
-        inferred = self.inverse_model(torch.cat((before, then), -1))
-        inverse_loss = (inferred - action).square().sum(-1).mean()
-        foreseen = self.forward_model(torch.cat((before, action), -1))
-        forward_loss = intrinsic_reward(foreseen, then, scale=1.0).mean()
-        return {"loss_inverse": inverse_loss, "loss_forward": forward_loss}
-
-    def _learn(self, losses: dict[str, Tensor]) -> None:
-        """Take one step of both models."""
-        self.optimizer.zero_grad(set_to_none=True)
-        share = self.forward_share
-        ((1.0 - share) * losses["loss_inverse"] + share * losses["loss_forward"]).backward()
-        self.optimizer.step()
+        return {
+            "inverse_loss": inverse_loss.detach(),
+            "forward_loss": forward_loss.detach(),
+            "intrinsic_reward": bonus,
+        }
 
     def checkpoint(self) -> dict[str, Any]:
         """Return models and optimizer as tensors and plain values."""
