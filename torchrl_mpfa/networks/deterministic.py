@@ -97,7 +97,21 @@ class Perceptron:
         return layer
 
 
-class Actor(nn.Module):
+class Layers(nn.Module):
+    """Hidden layers ``body``, and the last one ``head``."""
+
+    def __init__(self, inputs: int, outputs: int, perceptron: Perceptron) -> None:
+        super().__init__()
+        # One flat sequence: in small networks each nested call is felt.
+        self.body = nn.Sequential(*perceptron.hidden(inputs, perceptron.layers))
+        self.head = perceptron.last(outputs)
+
+    def layers(self) -> list[nn.Module]:
+        """Return all layers in their order."""
+        return [*self.body, self.head]
+
+
+class Actor(Layers):
     """Deterministic policy, which returns the action before its tanh as well."""
 
     def __init__(
@@ -108,10 +122,7 @@ class Actor(nn.Module):
         *,
         scale: ActionScale | None = None,
     ) -> None:
-        super().__init__()
-        # One flat sequence: in small networks each nested call is felt.
-        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
-        self.head = perceptron.last(action_size)
+        super().__init__(observation_size, action_size, perceptron)
         self.scale = scale
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,7 +134,7 @@ class Actor(nn.Module):
     def layers(self) -> list[nn.Module]:
         """Return all layers in their order, from observation to action."""
         scale = [] if self.scale is None else [self.scale]
-        return [*self.body, self.head, nn.Tanh(), *scale]
+        return [*super().layers(), nn.Tanh(), *scale]
 
 
 class Critic(nn.Module):
@@ -153,21 +164,12 @@ class Critic(nn.Module):
         return value
 
 
-class ValueNetwork(nn.Module):
+class ValueNetwork(Layers):
     """A perceptron with an output for each action."""
-
-    def __init__(self, observation_size: int, actions: int, perceptron: Perceptron) -> None:
-        super().__init__()
-        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
-        self.head = perceptron.last(actions)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
         return with_best(self.head(self.body(observation)))
-
-    def layers(self) -> list[nn.Module]:
-        """Return all layers in their order, from observation to values."""
-        return [*self.body, self.head]
 
 
 def with_best(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.deterministic import DirectModule, Perceptron
+from torchrl_mpfa.networks.deterministic import DirectModule, Layers, Perceptron
 
 _SCALE_BIAS = math.log(math.e - 1.0)
 """The softplus of this is one."""
@@ -52,13 +52,11 @@ def sample_tanh_normal(
     return action_scale(action), log_density - action_scale.half_width.log().sum()
 
 
-class StochasticNetwork(nn.Module):
+class StochasticNetwork(Layers):
     """Mean and scale of an action before its tanh, each from a head of its own."""
 
     def __init__(self, observation_size: int, action_size: int, perceptron: Perceptron) -> None:
-        super().__init__()
-        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
-        self.head = perceptron.last(action_size)
+        super().__init__(observation_size, action_size, perceptron)
         self.scale_head = perceptron.last(action_size)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,9 +104,8 @@ class StochasticActor(ProbabilisticActor):
 
     def layers(self) -> list[nn.Module]:
         """Return all layers in their order, from observation to the mean action."""
-        network = self.module[0].module
         scale = [] if self.action_scale is None else [self.action_scale]
-        return [*network.body, network.head, nn.Tanh(), *scale]
+        return [*self.module[0].module.layers(), nn.Tanh(), *scale]
 
     def outputs(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
