@@ -43,12 +43,12 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalTensorStorage,
 )
-from torchrl_mpfa.history import ReplayHistory
 from training.evaluating import Drivable, drive, filtered
 from training.files import run_script
 from training.pictures import Values, longest, trajectories_of
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
+from training.run.history import ReplayHistory
 from training.run.values import load_learner, values_of
 
 ROOT = Path(__file__).parents[1]

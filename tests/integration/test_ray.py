@@ -13,7 +13,6 @@ from tensordict import TensorDict
 
 from tests.methods.replays import make_transitions
 from tests.mpfa.transitions import same
-from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.integrations.ray import (
     MethodReplayBuffer,
     RaySignalReplayBuffer,
@@ -21,6 +20,7 @@ from torchrl_mpfa.integrations.ray import (
 )
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods import make_replay as make_local_replay
+from training.run.history import ReplayHistory
 
 CAPACITY = 64
 

@@ -14,7 +14,7 @@ PACKAGES = {
     "hydra": ["torchrl_mpfa.integrations"],
     "SignalLoss": [LOSSES],
     "MultiTensorSoftUpdate": [LEARNERS],
-    "ReplayHistory": ["torchrl_mpfa"],
+    "ReplayHistory": ["torchrl_mpfa", "torchrl_mpfa.history"],
     "make_value_table": ["torchrl_mpfa.networks"],
     "check_adjustment": ["torchrl_mpfa.testing"],
     "check_fusion": ["torchrl_mpfa.testing"],

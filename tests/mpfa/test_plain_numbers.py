@@ -18,7 +18,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
 )
 from torchrl_mpfa.checks import COUNT, SHARE, check
-from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.hvper import HVPERPenalty, ScheduledFusion
@@ -56,12 +55,6 @@ def with_alpha_and_beta():
     return buffer.sampler.state_dict()
 
 
-def recorded():
-    history = ReplayHistory(bins=THREE)
-    history.add(THREE, make_filled())
-    return history.state_dict()
-
-
 KEPT = {
     "rates": lambda: make_learner("sac", actor_lr=HALF, alpha_lr=HALF, tau=HALF).optimizer,
     "decay and delay": lambda: make_learner("td3", critic_weight_decay=HALF, policy_delay=THREE),
@@ -79,7 +72,6 @@ KEPT = {
         batch_size=THREE,
     ).state_dict(),
     "alpha and beta": with_alpha_and_beta,
-    "history": recorded,
     "boost": lambda: PositiveBoost(HALF),
     "decay": lambda: PositiveDecay(HALF),
     "floor": lambda: EntropyFusion(floor=HALF),
@@ -105,14 +97,6 @@ def test_number_of_numpy_is_kept_as_one_of_python(name):
         torch.save(kept, file)
         file.seek(0)
         torch.load(file, weights_only=True)
-
-
-@pytest.mark.parametrize("wrong", [-1, 1.5, True, "3"])
-def test_step_of_a_history_that_is_no_count_is_rejected_and_adds_nothing(wrong):
-    history = ReplayHistory()
-    with pytest.raises((TypeError, ValueError), match="step must be"):
-        history.add(wrong, make_filled())
-    assert history.state_dict() == {}
 
 
 def test_checked_values_are_returned_as_plain_numbers_in_their_order():

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa import SignalReplayBuffer
-from torchrl_mpfa.history import ReplayHistory
+from training.run.history import ReplayHistory
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 
@@ -203,3 +204,8 @@ def test_argument_out_of_range_is_rejected_by_name():
             make_value_table(**{"cell_of": len, "cells": 3, "actions": 2, name: 0})
     with pytest.raises(TypeError, match="policy must be one of make_value_table"):
         TabularQLearner(make_value_network(4, 5))
+
+
+def test_rate_of_numpy_is_kept_as_a_plain_number():
+    learner = make_table(lr=np.float32(0.5), gamma=np.float32(0.5))
+    assert [type(number) for number in (learner._rate, learner.gamma)] == [float, float]

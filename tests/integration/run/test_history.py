@@ -12,10 +12,10 @@ from torchrl_mpfa import (
     SignalSampler,
     SignalTensorStorage,
 )
-from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
+from training.run.history import ReplayHistory
 
 
 def filled(sampler, rows=200):
@@ -110,3 +110,18 @@ def test_loaded_history_continues():
         np.testing.assert_array_equal(counts, other.histograms()[name][2])
     with pytest.raises(ValueError, match="counts of 'priority' must have shape"):
         ReplayHistory(bins=3).load_state_dict({"priority": history.state_dict()["priority"]})
+
+
+def test_steps_and_bins_of_numpy_are_kept_as_plain_numbers():
+    history = ReplayHistory(bins=np.int64(3))
+    history.add(np.int64(7), filled(MPFASampler(200)))
+    (kind,) = {type(step) for entry in history.state_dict().values() for step in entry["steps"]}
+    assert kind is int
+
+
+@pytest.mark.parametrize("wrong", [-1, 1.5, True, "3"])
+def test_step_of_a_history_that_is_no_count_is_rejected_and_adds_nothing(wrong):
+    history = ReplayHistory()
+    with pytest.raises((TypeError, ValueError), match="step must be"):
+        history.add(wrong, filled(MPFASampler(200)))
+    assert history.state_dict() == {}
