@@ -174,7 +174,7 @@ def plot_histograms(
 
     Args:
         histories: Steps ``[T]``, edges of the bins ``[E + 1]`` and counts ``[T, E]`` of each kind
-            of number by its name, as ``ReplayHistory.histograms()`` of the core gives them.
+            of number by its name, as ``ReplayHistory.histograms()`` of the scripts gives them.
         path: The PNG file.
         columns: Panels in a row.
         xlabel: Label of the steps.
