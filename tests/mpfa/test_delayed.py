@@ -59,7 +59,6 @@ def test_any_first_call_makes_the_parts(tmp_path):
     filled = make_buffer()
     filled.extend(make_transitions(10))
     filled.dumps(tmp_path / "buffer")
-    batch = write_signals(filled.sample()).exclude("written_at")
     first = {
         "extend": lambda buffer: buffer.extend(make_transitions(1)),
         "add": lambda buffer: buffer.add(make_transitions(1)[0]),
@@ -77,8 +76,6 @@ def test_any_first_call_makes_the_parts(tmp_path):
         assert buffer.storage.signal_table is buffer.sampler.table, name
     with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
         make_delayed().sample()
-    with pytest.raises(IndexError, match=r"index must be in \[0, 0\)"):
-        make_delayed().update_tensordict_priority(batch)
 
 
 def test_statistics_do_not_make_the_parts():

@@ -31,7 +31,6 @@ from torchrl_mpfa.saving import (
     MANIFEST,
     new_dump,
     open_dump,
-    seal_dump,
 )
 
 
@@ -189,11 +188,6 @@ def test_folder_of_torchrl_is_rejected_and_not_unpickled(tmp_path):
     assert not trap.exists()
 
 
-def test_folder_holds_no_pickles(dumped):
-    files = [file for file in (dumped / "dump-1").rglob("*") if file.is_file()]
-    assert {file.suffix for file in files} == {".memmap", ".json", ".pt"}
-
-
 def files_of(folder):
     beside = (MANIFEST, ".lock")
     return sorted(file for file in folder.rglob("*") if file.is_file() and file.name not in beside)
@@ -290,18 +284,6 @@ def test_storage_notices_damage_without_a_buffer(tmp_path):
     file.write_bytes(file.read_bytes()[:-4])
     with pytest.raises(ValueError, match=f"{file.name} is damaged"):
         second.loads(tmp_path / "storage")
-
-
-def test_folder_is_sealed_and_opened_without_a_buffer(tmp_path):
-    with new_dump(tmp_path / "dump") as folder:
-        (folder / "a").mkdir()
-        (folder / "a/b.json").write_text("{}")
-    assert open_dump(tmp_path / "dump") == folder
-    (folder / "a/b.json").write_text("[]")
-    with pytest.raises(ValueError, match=r"b\.json is damaged"):
-        open_dump(tmp_path / "dump")
-    seal_dump(tmp_path / "dump", folder)
-    assert open_dump(tmp_path / "dump") == folder
 
 
 DUMPING = """

@@ -1,7 +1,5 @@
 """A sampler in a buffer or storage that is not its own, and names and slots that are none."""
 
-import warnings
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -13,7 +11,6 @@ from tests.mpfa.transitions import (
     make_transitions,
     rejected,
     same,
-    seeded,
     snapshot,
     train_rounds,
     write_signals,
@@ -98,14 +95,6 @@ def test_signals_follow_each_write_of_two_buffers_that_share_a_storage():
         assert buffer.sampler.table.rewards.float().equal(expected)
 
 
-def test_a_buffer_and_storage_of_ours_need_no_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        buffer = make_filled(16)
-        train_rounds(buffer, 2)
-        buffer.update_priority(torch.tensor([1]), torch.tensor([2.0]))  # By hand, on purpose.
-
-
 def test_a_rejected_update_changes_nothing_at_all():
     """Not even the weights, which were counted before an adjustment failed."""
 
@@ -120,42 +109,3 @@ def test_a_rejected_update_changes_nothing_at_all():
     buffer.sampler.adjustments = (Broken(),)
     with rejected(buffer, ValueError, "adjusted priorities must be finite"):
         buffer.update_tensordict_priority(batch)
-
-
-def make_two_dimensional(steps=6, robots=3):
-    number = torch.arange(steps * robots).reshape(steps, robots)
-    sampler = TreeSampler(steps * robots, 1.0, 0.4, 0.0)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(steps * robots, ndim=2),
-        sampler=sampler,
-        batch_size=200,
-        generator=seeded(2),
-    )
-    buffer.extend(TensorDict({"number": number}, [steps, robots]))
-    return buffer, sampler
-
-
-def test_a_storage_of_two_dimensions_is_sampled_and_updated_as_torchrl_does():
-    buffer, sampler = make_two_dimensional()
-    batch = buffer.sample()
-    assert batch["index"].shape == (200, 2)
-    # TorchRL turns the two dimensions around.
-    assert batch["number"].equal(batch["index"][:, 0] + batch["index"][:, 1] * 3)
-    slots = batch["index"][:, 0] * 6 + batch["index"][:, 1]
-    batch["td_error"] = slots.float() + 1.0
-    buffer.update_tensordict_priority(batch)
-    assert sampler.priorities().tolist() == [float(n + 1) for n in range(18)]
-    place = torch.tensor([2]), torch.tensor([5])
-    sampler.update_priority(place, torch.tensor([7.0]), storage=buffer._storage)
-    assert sampler.priorities()[17] == 7.0
-
-
-def test_a_place_outside_a_storage_of_two_dimensions_is_rejected():
-    buffer, sampler = make_two_dimensional()
-    before = sampler.state_dict()
-    # As a number it would be a slot: 0 * 6 + 6.
-    with pytest.raises(IndexError, match=r"within the storage's shape \[3, 6\], got \[0, 6\]"):
-        sampler.update_priority(torch.tensor([[0, 6]]), torch.ones(1), storage=buffer._storage)
-    with pytest.raises(RuntimeError, match="index must have one dimension"):
-        sampler.update_priority(torch.tensor([[0, 6]]), torch.ones(1))
-    assert same(before, sampler.state_dict())

@@ -172,50 +172,6 @@ class Replay(RuleBasedStateMachine):
         with rejected(self.buffer, (KeyError, ValueError)):
             self.buffer.add(data[-1]) if one else self.buffer.extend(data)
 
-    @precondition(lambda self: self.slots)
-    @rule(
-        wrong=st.sampled_from([torch.nan, -1.0, torch.inf]),
-        name=st.sampled_from(["td_error", "action_gradient"]),
-        how=st.sampled_from(["value", "missing", "index", "shape"]),
-    )
-    def rejected_update(self, wrong, name, how):
-        batch = write_signals(self.buffer.sample())
-        if how == "value":
-            batch["signals", name][1] = wrong
-        elif how == "missing":
-            del batch["signals", name]
-        elif how == "index":
-            batch["index"][2] = CAPACITY
-        else:
-            batch["signals", name] = torch.ones(4, 2)
-        with rejected(self.buffer, (KeyError, ValueError, IndexError)):
-            self.buffer.update_tensordict_priority(batch)
-
-    @rule(
-        path=st.sampled_from(
-            [
-                ("_sampler", "_signals", "rows"),
-                ("_sampler", "_signals", "size"),
-                ("_sampler", "_eps"),
-                ("_sampler", "_sum_tree"),
-                ("_writer", "_cursor"),
-                ("_rng",),
-            ]
-        ),
-        value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
-    )
-    def rejected_load(self, path, value):
-        may_be = {"_rng": value is None, "_eps": type(value) is int and value > 0}
-        if may_be.get(path[-1], False):
-            return
-        state = snapshot(self.buffer)
-        place = state
-        for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = value
-        with rejected(self.buffer, (KeyError, ValueError, TypeError)):
-            self.buffer.load_state_dict(state)
-
     @invariant()
     def the_buffer_holds_what_the_model_holds(self):
         if not hasattr(self, "buffer"):

@@ -148,17 +148,6 @@ def test_flipped_bit_is_noticed_or_harmless(tmp_path):
     assert noticed > 190
 
 
-def test_tensors_stay_in_the_file_until_they_are_read(tmp_path):
-    path = tmp_path / "state.pt"
-    save_atomically({"a": torch.arange(100)}, path)
-    assert load_safely(path, mmap=True)["a"].tolist() == list(range(100))
-
-
-def test_missing_file_is_an_error(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load_safely(tmp_path / "none.pt")
-
-
 @pytest.mark.parametrize("wrong", [torch.nan, torch.tensor([0.0, torch.inf])])
 def test_saved_number_that_is_not_finite_is_found_in_any_depth(wrong):
     state = {"groups": [{"lr": 1.0, "params": (3, "a", None)}], "weight": torch.zeros(2)}

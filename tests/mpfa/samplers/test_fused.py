@@ -81,16 +81,6 @@ def test_own_signals_go_from_the_batch_to_the_priority():
     assert priorities(buffer)[2:4] == pytest.approx([3.0, 5.25])
 
 
-def test_own_signals_show_in_the_statistics():
-    buffer = make_own_buffer()
-    buffer.extend(make_own_transitions(8))
-    buffer.sample()
-    update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
-    stats = buffer.stats()
-    assert stats["weight/novelty"] == pytest.approx(0.5)
-    assert stats["weight/reward"] == 0.0
-
-
 def test_own_signals_are_saved_and_loaded(tmp_path):
     first, second = make_own_buffer(), make_own_buffer()
     first.extend(make_own_transitions(6))

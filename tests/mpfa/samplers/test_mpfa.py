@@ -109,20 +109,6 @@ def test_options_reach_the_chain():
     assert priorities(buffer)[[0, 3]].tolist() == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_histogram_of_50000_samples_has_the_probabilities_of_eq_8_after_a_wrap():
-    buffer = make_buffer(24, 50, entropy_refresh=0)
-    generator = seeded(3)
-    for part in range(5):
-        buffer.extend(make_transitions(10, seed=part, first=10 * part))
-        buffer.update_tensordict_priority(write_signals(buffer.sample(), generator=generator))
-    expected = torch.tensor(oracles.probabilities(priorities(buffer).tolist(), 0.6))
-    assert expected.max() > 2 * expected.min()
-    sampled = torch.cat([buffer.sampler.sample(buffer.storage, 50)[0] for _ in range(1000)])
-    found = torch.bincount(sampled, minlength=24) / 50_000
-    tolerance = 5 * (expected * (1 - expected) / 50_000).sqrt()
-    assert ((found - expected).abs() < tolerance).all()
-
-
 def test_importance_weights_of_a_batch_equal_the_oracle():
     buffer = make_buffer(32, 16, beta=0.7)
     buffer.extend(make_transitions(40))
@@ -161,21 +147,6 @@ def test_of_a_slot_that_appears_twice_in_a_batch_the_last_entry_counts():
     table = buffer.storage.signal_table
     assert table.rows[[3, 5], table.column["td_error"]].tolist() == [2.0, 4.0]
     assert priorities(buffer)[[3, 5]].tolist() == [2.0, 4.0]
-
-
-def test_of_slots_that_repeat_among_many_the_last_entry_counts_with_two_threads():
-    torch.set_num_threads(2)  # One writes in the order of the entries anyway.
-    buffer = make_filled(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
-    table = buffer.storage.signal_table
-    for seed in range(10):
-        slots = torch.randint(8, (40_000,), generator=seeded(seed))
-        batch = set_batch(buffer, slots)
-        error = torch.rand(40_000, generator=seeded(seed + 10))
-        batch["signals"] = TensorDict({"td_error": error, "action_gradient": error}, [40_000])
-        buffer.update_tensordict_priority(batch)
-        last = dict(zip(slots.tolist(), error.tolist(), strict=True))
-        assert table.rows[[*last], table.column["td_error"]].tolist() == [*last.values()]
-        assert priorities(buffer)[[*last]].tolist() == [*last.values()]
 
 
 def test_of_slots_that_repeat_among_many_the_last_position_is_found():

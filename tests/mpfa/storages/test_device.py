@@ -166,22 +166,6 @@ def test_a_sampler_follows_a_storage_to_the_device_of_its_first_transitions():
     assert buffer.sample()["index"].device == DEVICE
 
 
-def test_torchrls_buffer_with_a_tree_sampler_samples_there_by_priority():
-    sampler = TreeSampler(20, 1.0, 0.4, 0.0)
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(20, device=DEVICE), sampler=sampler, batch_size=500
-    )
-    buffer.extend(torch.arange(20))
-    priority = torch.zeros(20) + 1e-9
-    priority[[3, 7]] = torch.tensor([1.0, 3.0])
-    buffer.update_priority(torch.arange(20), priority)
-    sampled = buffer.sample()
-    assert sampled.device == DEVICE
-    shares = torch.bincount(sampled.cpu(), minlength=20) / 500
-    assert shares[[3, 7]].sum() == 1.0
-    assert 0.65 < shares[7] < 0.85
-
-
 def test_a_device_other_than_that_of_the_storage_is_rejected():
     sampler = MPFASampler(CAPACITY, device="cpu")
     with pytest.raises(ValueError, match="device must be that of the storage, cuda:0, or None"):
@@ -203,15 +187,6 @@ def test_a_state_of_one_device_loads_on_the_other(kind, first):
         give_signals(buffer, torch.arange(6), seed=5)
     assert same(loaded.sampler.priorities().cpu(), saved.sampler.priorities().cpu())
     assert same(loaded.storage.signal_table.rows.cpu(), saved.storage.signal_table.rows.cpu())
-
-
-def test_a_new_storage_there_takes_a_state_of_the_cpu():
-    saved = make_there(device=CPU)
-    storage = SignalTensorStorage(CAPACITY, device=DEVICE)
-    loaded = make_buffer(CAPACITY, BATCH, storage=storage)
-    loaded.load_state_dict(saved.state_dict())
-    assert loaded.sample()["observation"].device == DEVICE
-    assert loaded.storage.signal_table.rows.device == DEVICE
 
 
 def test_the_same_seed_samples_the_same_batches_there():

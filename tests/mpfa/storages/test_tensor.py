@@ -225,54 +225,11 @@ def test_an_emptied_buffer_forgets_the_signals_and_can_be_filled_again(make_stor
     assert buffer.sample()["index"].max() < 3
 
 
-def test_rewards_and_own_signals_are_read_under_the_keys_they_are_given():
-    novelty = Signal("novelty", key=("info", "novelty"), known_at="write", priority=torch.exp)
-    storage = SignalTensorStorage(4)
-    reward_key = ("next", "agent", "reward")
-    buffer = make_buffer(
-        4,
-        storage=storage,
-        signals=["td_error", novelty],
-        reward_key=reward_key,
-    )
-    data = TensorDict(
-        {
-            "next": {"agent": {"reward": torch.tensor([[1.0], [-2.0]])}},
-            "info": {"novelty": torch.tensor([0.0, 1.0])},
-        },
-        [2],
-    )
-    buffer.extend(data)
-    assert storage.signal_table.rewards.tolist() == [1.0, -2.0]
-    assert column(storage, "novelty").tolist() == pytest.approx([1.0, 2.7182817])
-
-
-@pytest.mark.parametrize("rows", [2, 3])
-def test_rewards_that_are_not_one_finite_number_are_rejected_before_the_write(rows):
-    buffer = make_buffer(4)
-    buffer.extend(make_transitions(1))
-    wide = make_transitions(rows)
-    wide["next", "reward"] = torch.zeros(rows, 2)
-    with rejected(buffer, ValueError, r"'reward'\) must have the shape \[1\] .*got \[2\]"):
-        buffer.extend(wide)
-    for wrong in (torch.nan, torch.inf, -torch.inf):
-        data = make_transitions(rows, rewards=[0.0] * (rows - 1) + [wrong])
-        with rejected(buffer, ValueError, f"'reward'.* must be finite, got {wrong}"):
-            buffer.extend(data)
-
-
 def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
     bad = Signal("bad", key=("next", "reward"), known_at="write", priority=torch.neg)
     buffer = make_buffer(4, signals=["td_error", bad])
     with rejected(buffer, ValueError, r"signal 'bad' must be finite and not negative, got -1.0"):
         buffer.extend(make_transitions(1, rewards=[1.0]))
-
-
-def test_memory_mapped_signals_lie_in_the_scratch_folder(tmp_path):
-    storage = SignalMemmapStorage(8, scratch_dir=tmp_path)
-    make_buffer(8, storage=storage)
-    file = tmp_path / "signals.memmap"
-    assert file.stat().st_size == 8 * 6 * 8
 
 
 def test_torchrls_own_sampler_may_sample_the_storage():
