@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.methods.replays import make_transitions, seeded
+from tests.mpfa.transitions import make_rows
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.checks import rules_of
 from torchrl_mpfa.methods import (
@@ -28,24 +29,13 @@ def more(name):
     return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if asks else {}
 
 
-def make_whole_transitions(count):
-    made = make_transitions(count)
-    made["observation"] = torch.randn(count, 6, generator=seeded(1))
-    made["action"] = torch.rand(count, 2, generator=seeded(2)) * 2 - 1
-    made["behavior_mean"] = made["action"] + 0.1
-    made["behavior_sigma"] = torch.full((count, 1), 0.3)
-    made["episode"] = torch.arange(count).unsqueeze(1) // 10
-    made["next", "done"] = made["episode"] < made["episode"].roll(-1)
-    return made
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
     replay = make_replay(name, capacity=64, batch_size=8, generator=seeded(0), **more(name))
     assert isinstance(replay.buffer, SignalReplayBuffer)
     assert replay.method.name == ALIASES.get(name, name) or name in ALIASES
     assert replay.signals == tuple(loss_options(name)["signals"])
-    replay.buffer.extend(make_whole_transitions(64))
+    replay.buffer.extend(make_rows(64, observed=6))
     for _ in range(3):
         draws = 0
         for draw in replay.select(replay.buffer):
@@ -190,15 +180,6 @@ def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():
 @pytest.mark.parametrize("name", ["uniform", "pal", "cer"])
 def test_annealing_without_priorities_does_nothing(name):
     make_replay(name, capacity=100).anneal(1.0)
-
-
-def test_batches_follow_the_generator():
-    def sampled():
-        replay = make_replay("per", capacity=100, batch_size=20, generator=seeded(5))
-        replay.buffer.extend(make_transitions(100))
-        return replay.buffer.sample()["index"]
-
-    assert sampled().equal(sampled())
 
 
 def test_method_with_a_hook_of_0_4_that_nothing_calls_is_rejected():

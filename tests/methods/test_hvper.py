@@ -7,7 +7,6 @@ import torch
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.adjustment import BatchFacts
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -69,12 +68,6 @@ def test_value_and_error_are_between_zero_and_one():
         for data in (torch.rand(9, generator=seeded(3)) * 100, torch.zeros(4), torch.ones(1)):
             found = function(data)
             assert ((found >= 0) & (found <= 1)).all()
-
-
-def test_priority_of_equal_transitions_falls_with_their_replays():
-    facts = BatchFacts(torch.zeros(3), torch.tensor([1.0, 10.0, 100.0]), torch.arange(3))
-    found = HVPERPenalty()(torch.full((3,), 0.5), facts)
-    assert found[0] > found[1] > found[2] >= EPS
 
 
 def test_negative_value_is_no_error_as_only_its_place_is_kept():

@@ -71,39 +71,6 @@ def test_policy_may_be_on_another_device_than_the_batch():
     assert torch.equal(chosen["action"], torch.zeros(4, 2))
 
 
-def mixed_batches(sigma, *, spread, generator, count=256):
-    """Three batches, each half the policy's and half uniformly random, and their shares of it.
-
-    Each transition of the policy's has the noise of an episode of its own, as the scripts have it,
-    and is clipped to the range of actions.
-    """
-    policy = torch.tanh(torch.randn(3, count, 2, generator=generator) * spread)
-    own = torch.rand(3, count, 1, generator=generator) < 0.5
-    noise = torch.randn(3, count, 2, generator=generator) * sigma
-    noise = noise * torch.rand(3, count, 1, generator=generator)
-    uniform = torch.rand(3, count, 2, generator=generator) * 2 - 1
-    action = torch.where(own, (policy + noise).clamp(-1, 1), uniform)
-    return action - policy, own.squeeze(-1)
-
-
-@pytest.mark.parametrize("spread", [0.003, 0.5, 1.5])
-@pytest.mark.parametrize("sigma", [0.2, 0.6, 0.8, 1.0])
-def test_uniformly_random_actions_do_not_score_better_than_the_policys(sigma, spread):
-    generator, better, share = seeded(3), 0, 0.0
-    for _ in range(150):
-        deviation, own = mixed_batches(sigma, spread=spread, generator=generator)
-        # The noise of the episode that acts, anything between none and all of it.
-        variance = max((sigma * float(torch.rand((), generator=generator))) ** 2, 1e-3)
-        flat, mask = deviation.reshape(-1, 2), own.reshape(-1)
-        both = torch.stack((flat[mask][:256], flat[~mask][:256]))
-        mine, others = gaussian_divergence(both, variance=variance)
-        better += bool(mine < others)
-        chosen = int(gaussian_divergence(deviation, variance=variance).argmin())
-        share += float(own[chosen].double().mean()) - float(own.double().mean())
-    assert better > 0.7 * 150
-    assert share > 0
-
-
 def sampled(policy, shifts, *, count=64, sigma=0.2):
     """Batches whose actions are the policy's with noise, each shifted by so much."""
     observation = torch.randn(len(shifts) * count, 6, generator=seeded(0))

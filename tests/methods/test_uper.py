@@ -5,17 +5,14 @@ from itertools import pairwise
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.mpfa.learning import KINDS, differentiate, make_apart, make_batch
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import ActorCritic, make_actor, make_critic
-from torchrl_mpfa.learners import actor_critic
+from torchrl_mpfa import ActorCritic, make_actor
 from torchrl_mpfa.learners.networks import QUANTILES
 from torchrl_mpfa.losses.functional import LEAST_NOISE, quantile_loss
-from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -127,50 +124,3 @@ def test_critic_whose_last_layer_gives_more_than_q_is_rejected():
     with pytest.raises(ValueError, match="whose last linear layer has one output, got Linear"):
         ActorCritic(make_actor(5, 2), critic, signals=["information_gain"])
     assert "noise" not in ActorCritic(make_actor(5, 2), critic).networks
-
-
-def noisy_share(method, *, rows=1_000, updates=300):
-    """Share of the noisier half of transitions in the batches of a bandit with equal means."""
-    torch.manual_seed(0)
-    generator = seeded(0)
-    observation = torch.rand(rows, 2, generator=generator) * 2 - 1
-    noisy = observation[:, 0] > 0
-    reward = torch.where(noisy, 2.0, 0.3) * torch.randn(rows, generator=generator)
-    end = torch.ones(rows, 1, dtype=torch.bool)
-    after = {"observation": observation, "done": end, "terminated": end}
-    action = torch.zeros(rows, 1)
-    replay = make_replay(method, capacity=rows, batch_size=64, generator=generator)
-    replay.buffer.extend(
-        TensorDict(
-            {
-                "observation": observation,
-                "action": action,
-                "next": {**after, "reward": reward.unsqueeze(-1)},
-            },
-            [rows],
-        )
-    )
-    networks = make_actor(2, 1, width=32), make_critic(2, 1, width=32)
-    learner = ActorCritic(*networks, **loss_options(method), critic_lr=1e-3)
-    found = []
-    for _ in range(updates):
-        for draw in replay.select(replay.buffer):
-            found.append(noisy[draw.batch["index"]].float().mean().item())
-            learner.update(draw)
-            replay.buffer.update_tensordict_priority(draw.batch)
-    later = found[updates // 3 :]
-    return sum(later) / len(later)
-
-
-def test_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
-    assert noisy_share("per") > 0.7
-    assert 0.4 < noisy_share("uper") < 0.57
-    # Without the noise in its denominator it does as PER.
-    monkeypatch.setattr(
-        actor_critic,
-        "information_gain_priority",
-        lambda error, quantiles, *, least_noise: information_gain_priority(
-            error, torch.zeros_like(quantiles), least_noise=least_noise
-        ),
-    )
-    assert noisy_share("uper") > 0.6

@@ -11,7 +11,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from tests.mpfa import transitions
 from tests.mpfa.second_device import DEVICE
-from tests.mpfa.transitions import same, seeded
+from tests.mpfa.transitions import make_rows, same, seeded
 from torchrl_mpfa import (
     ActorCritic,
     MPFASampler,
@@ -26,34 +26,13 @@ from torchrl_mpfa.learners.adam import FlatAdam
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
 from torchrl_mpfa.selection import SampledBatch, one_batch
 
-OBSERVATION, ACTION = 5, 2
 MANY, BATCH, UPDATES = 4000, 16, 4
-
-
-def make_rows(count, seed=0):
-    def normal(size):
-        return torch.randn(count, size, generator=generator)
-
-    generator = seeded(seed)
-    end = torch.zeros(count, 1, dtype=torch.bool)
-    after = {"observation": normal(OBSERVATION), "reward": normal(1)}
-    return TensorDict(
-        {
-            "observation": normal(OBSERVATION),
-            "action": normal(ACTION).tanh(),
-            "episode": torch.arange(count).unsqueeze(1) // 10,
-            "behavior_mean": normal(ACTION).tanh(),
-            "behavior_sigma": torch.full((count, 1), 0.3),
-            "next": {**after, "done": end, "terminated": end.clone()},
-        },
-        [count],
-    )
 
 
 def make_learner(**options):
     torch.manual_seed(0)
-    actor = make_actor(OBSERVATION, ACTION, width=8)
-    critic = make_critic(OBSERVATION, ACTION, width=8)
+    actor = make_actor(5, 2, width=8)
+    critic = make_critic(5, 2, width=8)
     return ActorCritic(actor, critic, actor_lr=1e-2, critic_lr=1e-2, **options)
 
 

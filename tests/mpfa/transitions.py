@@ -30,6 +30,28 @@ def make_transitions(count, *, seed=0, first=0, rewards=None):
     )
 
 
+def make_rows(count, *, seed=0, observed=5, length=10):
+    """Transitions with all that any method asks for, in episodes of this length."""
+    generator, number = seeded(seed), torch.arange(count).unsqueeze(1)
+
+    def normal(size):
+        return torch.randn(count, size, generator=generator)
+
+    after = {"observation": normal(observed), "reward": normal(1)}
+    after |= {"done": number % length == length - 1, "terminated": torch.zeros_like(number).bool()}
+    return TensorDict(
+        {
+            "observation": normal(observed),
+            "action": normal(2).tanh(),
+            "episode": number // length,
+            "behavior_mean": normal(2).tanh(),
+            "behavior_sigma": torch.full((count, 1), 0.3),
+            "next": after,
+        },
+        [count],
+    )
+
+
 _OF_BUFFER = {"transform", "transform_factory", "writer", "priority_key", "allow_nonfinite"}
 
 

@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.samplers.test_trees import MADE
 from tests.mpfa.second_device import DEVICE
-from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same, seeded
+from tests.mpfa.transitions import make_buffer, make_rows, make_transitions, rejected, same, seeded
 from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.samplers import TreeSampler
@@ -40,28 +39,6 @@ def give_signals(buffer, slots, *, seed=0):
     buffer.sampler.update_signals(slots.to(device), signals, storage=buffer.storage)
 
 
-def full_rows(count, *, seed):
-    """Transitions with what any method asks for."""
-    generator, end = seeded(seed), torch.zeros(count, 1, dtype=torch.bool)
-    end[4::5] = True
-    return TensorDict(
-        {
-            "observation": torch.rand(count, 24, generator=generator),
-            "action": torch.rand(count, 2, generator=generator),
-            "episode": torch.arange(count) // 5,
-            "behavior_mean": torch.zeros(count, 2),
-            "behavior_sigma": torch.ones(count, 1),
-            "next": {
-                "observation": torch.rand(count, 24, generator=generator),
-                "reward": torch.randn(count, 1, generator=generator),
-                "done": end,
-                "terminated": torch.zeros(count, 1, dtype=torch.bool),
-            },
-        },
-        [count],
-    )
-
-
 @pytest.mark.parametrize("name", METHODS_THERE)
 def test_each_method_samples_and_learns_there(name):
     assert name in METHODS
@@ -74,7 +51,7 @@ def test_each_method_samples_and_learns_there(name):
         sigma=0.1,
     )
     for seed in range(3):
-        replay.buffer.extend(full_rows(20, seed=seed))
+        replay.buffer.extend(make_rows(20, seed=seed, observed=24, length=5))
         for sampled in replay.select(replay.buffer):
             batch = sampled.batch
             assert {value.device for value in batch.values(True, True)} == {DEVICE}
