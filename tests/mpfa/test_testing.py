@@ -33,7 +33,6 @@ from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
     [
         PositiveBoost(),
         PositiveBoost(bound="cap"),
-        PositiveBoost(target_share=0.5),
         PositiveDecay(),
         PositiveDecay(position="rank"),
         PositiveDecay(position="count"),

@@ -153,38 +153,6 @@ def test_weights_may_be_a_column():
     assert differentiate(learner, batch)["loss_value"].equal(expected)
 
 
-def test_end_is_not_bootstrapped_and_a_time_limit_is():
-    batch = make_batch()
-    ended, limited, neither = batch.clone(), batch.clone(), batch.clone()
-    true, false = torch.ones(6, 1, dtype=torch.bool), torch.zeros(6, 1, dtype=torch.bool)
-    for each, terminated, truncated in (
-        (ended, true, false),
-        (limited, false, true),
-        (neither, false, false),
-    ):
-        each["next", "terminated"], each["next", "truncated"] = terminated, truncated
-        each["next", "done"] = terminated | truncated
-    learner = make_learner()
-    reward = batch["next", "reward"].squeeze(1)
-    assert learner.targets_of(ended).equal(reward)
-    assert learner.targets_of(limited).equal(learner.targets_of(neither))
-    assert not learner.targets_of(limited).equal(reward)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("trains", ["critic", "actor"])
-def test_each_loss_moves_its_own_parameters_alone(kind, trains):
-    learner = make_apart(kind, saturation_penalty=0.1)
-    log = differentiate(learner, make_batch(), trains=trains)
-    own = ("critics",) if trains == "critic" else ("actor", "temperature")
-    names = {name.split(".")[0] for name in gradients_of(learner)}
-    assert names == {name for name in own if name in learner.networks}
-    losses = {"loss_value"} if trains == "critic" else {"loss_actor", "loss_alpha"} & set(log)
-    assert {key for key in log if key.startswith("loss")} == losses
-    assert not any(value.requires_grad for value in log.values())
-    assert all(value.grad is None for value in learner.targets.parameters())
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_gradient_reaches_the_batch_and_only_signals_are_added(kind):
     learner, batch = make_apart(kind), make_batch()
@@ -261,15 +229,6 @@ def test_networks_in_double_precision_learn_in_it(kind):
     log = learner.update(batch)
     assert log["loss_value"].dtype == torch.double
     assert batch["signals", "action_gradient"].dtype == torch.double
-
-
-@pytest.mark.parametrize(
-    "key", ["observation", "action", "next", ("next", "reward"), ("next", "terminated")], ids=str
-)
-@pytest.mark.parametrize("kind", KINDS)
-def test_missing_input_is_named(kind, key):
-    with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
-        make_apart(kind).update(make_batch().exclude(key))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.7])
