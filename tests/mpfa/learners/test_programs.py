@@ -124,7 +124,8 @@ def test_program_is_made_again_for_another_precision():
 
 
 def test_slices_of_other_tensors_need_no_program_of_their_own():
-    plain, traced = make_pair("ddpg")
+    made = []
+    plain, traced = make_pair("ddpg", counting(made))
     for step in range(1, 12):
         for learner in (plain, traced):
             batch = make_batch(seed=step)
@@ -132,6 +133,7 @@ def test_slices_of_other_tensors_need_no_program_of_their_own():
             batch["observation"] = wide[:, ::step]
             learner.update(batch)
     assert_alike(plain, traced)
+    assert len(made) == 1
 
 
 def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_losses(monkeypatch):
