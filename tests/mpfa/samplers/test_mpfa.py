@@ -113,7 +113,9 @@ def test_importance_weights_of_a_batch_equal_the_oracle():
     buffer = make_buffer(32, 16, beta=0.7)
     buffer.extend(make_transitions(40))
     train_rounds(buffer, 10)
+    buffer.update_priority(torch.tensor([5]), torch.tensor([0.0]))
     batch = buffer.sample()
+    assert 5 not in batch["index"]  # The lowest of the buffer, and not of the batch, counts.
     expected = oracles.importance_weights(
         priorities(buffer).tolist(), 0.6, 0.7, batch["index"].tolist()
     )
