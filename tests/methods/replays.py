@@ -17,7 +17,7 @@ def make_transitions(count, *, seed=0):
     )
 
 
-def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, seed=0):
+def make_buffer(sampler, capacity, batch_size, *, filled=None, seed=0):
     """A buffer with this many random transitions."""
     storage = SignalTensorStorage(capacity)
     buffer = make_any_buffer(capacity, batch_size, storage=storage, sampler=sampler, seed=seed)
@@ -40,13 +40,8 @@ def set_signals(buffer, **signals):
     buffer.update_tensordict_priority(data)
 
 
-def frequencies(indices, capacity):
-    counts = torch.bincount(indices, minlength=capacity).double()
-    return counts / counts.sum()
-
-
 def assert_shares(indices, expected, *, samples):
     """The frequencies of slots are their probabilities, as far as chance allows."""
-    found = frequencies(indices, len(expected))
+    found = torch.bincount(indices, minlength=len(expected)).double() / len(indices)
     sigma = (expected * (1 - expected) / samples).sqrt()
     assert ((found - expected).abs() <= SPREAD * sigma + 1e-9).all(), (found, expected)

@@ -43,7 +43,7 @@ def test_priorities_are_those_of_the_formula(fraction):
         fusion=value_schedule(),
         adjustments=[HVPERPenalty(penalty=KAPPA, floor=EPS)],
     )
-    buffer = make_buffer(sampler, 6, 9, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    buffer = make_buffer(sampler, 6, 9)
     sampler.anneal(fraction)
     batch = buffer.sample()
     # A row for each slot that was sampled, as of a slot that is in a batch twice the last counts.
@@ -74,7 +74,7 @@ def test_negative_value_is_no_error_as_only_its_place_is_kept():
     sampler = SignalSampler(
         4, 0.6, 0.4, EPS, signals=[RELATIVE_VALUE, RELATIVE_ERROR], fusion=value_schedule()
     )
-    buffer = make_buffer(sampler, 4, 4, filled=0, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    buffer = make_buffer(sampler, 4, 4, filled=0)
     buffer.extend(make_transitions(4))
     batch = buffer.sample()
     batch["signals", "value"] = torch.full((4,), -50.0)
@@ -87,7 +87,7 @@ def relative_errors(batches, errors, *, stale=()):
     signals = [RELATIVE_VALUE, RELATIVE_ERROR]
     count = len(errors)
     sampler = SignalSampler(count, 0.6, 0.4, EPS, signals=signals, fusion=value_schedule())
-    storage = make_buffer(sampler, count, 8, signals=signals).storage
+    storage = make_buffer(sampler, count, 8).storage
     table = storage.signal_table
     slots = torch.arange(count)
     written_at = table.written_at(slots)

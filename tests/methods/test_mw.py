@@ -21,7 +21,7 @@ def make_capped(capacity, batch_size, cap, *, filled=None):
         replay_cap=cap,
         entropy_refresh=0,  # Means are those of the moment.
     )
-    return make_buffer(sampler, capacity, batch_size, filled=filled, signals=SIGNALS)
+    return make_buffer(sampler, capacity, batch_size, filled=filled)
 
 
 def counts_of(buffer):

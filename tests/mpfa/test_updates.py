@@ -14,7 +14,6 @@ from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import make_rows, same, seeded
 from torchrl_mpfa import (
     ActorCritic,
-    MPFASampler,
     PositiveBoost,
     PositiveDecay,
     SignalTensorStorage,
@@ -22,7 +21,6 @@ from torchrl_mpfa import (
     make_critic,
     run_updates,
 )
-from torchrl_mpfa.learners.adam import FlatAdam
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
 from torchrl_mpfa.selection import SampledBatch, one_batch
 
@@ -76,8 +74,10 @@ class Counting:
         return {"loss_value": torch.tensor(float(self.updates))}
 
 
-def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
-    ours, theirs = make_buffer(), make_buffer()
+@pytest.mark.parametrize("position", ["batch", "rank", "count"])
+def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait(position):
+    adjustments = PositiveBoost(), PositiveDecay(position=position)
+    ours, theirs = (make_buffer(adjustments=adjustments) for _ in range(2))
     first, second = make_learner(), make_learner()
     for _ in range(3):
         log, batch = run_updates(ours, first, updates=UPDATES)
@@ -87,20 +87,6 @@ def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
     assert same(first.state_dict(), second.state_dict())
     assert same(ours.state_dict(), theirs.state_dict())
     assert first.updates == 3 * UPDATES
-
-
-def test_one_call_samples_and_one_writes(monkeypatch):
-    calls = []
-    for name in ("sample", "update_signals"):
-        method = getattr(MPFASampler, name)
-
-        def spy(self, *args, name=name, method=method, **kwargs):
-            calls.append(name)
-            return method(self, *args, **kwargs)
-
-        monkeypatch.setattr(MPFASampler, name, spy)
-    run_updates(make_buffer(), make_learner(), updates=UPDATES)
-    assert calls == ["sample", "update_signals"]
 
 
 class OneBatch(PositiveBoost):
@@ -118,33 +104,6 @@ def test_an_own_adjustment_of_one_batch_gets_them_one_by_one_and_the_same_number
         run_updates(buffer, make_learner(), updates=UPDATES)
         found.append(buffer.sampler.priorities())
     assert same(*found)
-
-
-def test_a_round_follows_a_change_of_an_option_and_looks_for_it_once(monkeypatch):
-    looks, found = [], []
-    holds = FlatAdam.holds
-    monkeypatch.setattr(FlatAdam, "holds", lambda self: looks.append(1) or holds(self))
-    for changed in (False, True):
-        learner, buffer = make_learner(compile={"disable": True}), make_buffer()
-        run_updates(buffer, learner, updates=UPDATES)
-        looks.clear()
-        learner.saturation_penalty = 5.0 * changed
-        learner.saturation_limit = 0.0
-        found.append(run_updates(buffer, learner, updates=UPDATES)[0]["loss_actor"])
-        assert len(looks) == 1
-    assert not same(*found)
-
-
-@pytest.mark.parametrize("position", ["batch", "rank", "count"])
-def test_each_batch_has_places_and_a_mean_of_its_own(position):
-    ours = make_replay(
-        capacity=MANY, batch_size=BATCH, generator=seeded(1), decay_position=position
-    ).buffer
-    ours.extend(make_rows(MANY))
-    theirs = copy.deepcopy(ours)
-    run_updates(ours, make_learner(), updates=UPDATES)
-    run_loop(theirs, make_learner(), UPDATES)
-    assert same(ours.sampler.priorities(), theirs.sampler.priorities())
 
 
 def test_of_a_transition_that_was_sampled_twice_the_last_update_counts():
@@ -288,21 +247,6 @@ def test_batches_are_prepared_before_the_learner_gets_them(updates):
     assert bool((written == updates).all())
 
 
-def test_prepared_batches_of_a_round_are_learned_from_at_once_by_the_program(monkeypatch):
-    found = []
-    for prepare in (None, lambda sampled: replace(sampled, batch=sampled.batch.copy())):
-        buffer, learner = make_buffer(), make_learner(compile={"disable": True})
-        log, batch = run_updates(buffer, learner, updates=UPDATES, prepare=prepare)
-        assert learner.updates == UPDATES
-        found.append((log, batch.to_dict(), learner.state_dict(), buffer.state_dict()))
-    assert same(*found)
-    # One step after the other is what the program does by itself.
-    monkeypatch.setattr(ActorCritic, "_step", None)
-    learner = make_learner(compile={"disable": True})
-    run_updates(make_buffer(), learner, updates=UPDATES, prepare=lambda sampled: sampled)
-    assert learner.updates == UPDATES
-
-
 def test_prepare_gets_the_batches_of_a_round_together_with_their_number():
     learner, seen = Counting(), []
 
@@ -416,35 +360,3 @@ def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
     assert batch.device == torch.device("cpu")
     table = buffer.storage.signal_table
     assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
-
-
-class Elsewhere(torch.Tensor):
-    """Stands for a tensor on a GPU: cannot be computed with beside one of the CPU."""
-
-    @classmethod
-    def __torch_function__(cls, func, types, args=(), kwargs=None):
-        here = [each for each in args if type(each) is torch.Tensor and each.ndim]
-        # Copying goes across devices, and a mask of the CPU may select.
-        if here and func.__name__ not in ("copy_", "__getitem__"):
-            raise RuntimeError("expected all tensors to be on the same device")
-        with torch._C.DisableTorchFunctionSubclass():
-            found = func(*args, **(kwargs or {}))
-        if func.__name__ == "to" or not isinstance(found, torch.Tensor):
-            return found.as_subclass(torch.Tensor) if isinstance(found, torch.Tensor) else found
-        return found.as_subclass(cls)
-
-
-def test_batches_on_another_device_than_the_signals_update_them():
-    ours, theirs = make_buffer(300), make_buffer(300)
-    for buffer, kind in ((ours, Elsewhere), (theirs, torch.Tensor)):
-        batch = buffer.sample()
-        buffer.extend(make_rows(100))  # Some of the rows are overwritten before they come back.
-        value = batch["action"].square().sum(-1).as_subclass(kind)
-        stale = buffer.sampler.update_signals(
-            batch["index"],
-            {"td_error": value, "action_gradient": value},
-            storage=buffer.storage,
-            written_at=batch["written_at"].as_subclass(kind),
-        )
-        assert 0 < stale < BATCH
-    assert same(ours.sampler.state_dict(), theirs.sampler.state_dict())

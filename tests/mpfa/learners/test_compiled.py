@@ -128,6 +128,7 @@ def test_checkpoint_of_an_eager_or_compiled_learner_loads_in_the_other(
     first, second = make_pair(name)[:: -1 if not to_compiled else 1]
     third = make_pair(name)[1 if not to_compiled else 0]
     second.update(make_batch(seed=9))
+    first.anneal(0.3)
     for seed in range(updates):
         update_both([first], seed)
     state = first.state_dict()
@@ -138,6 +139,8 @@ def test_checkpoint_of_an_eager_or_compiled_learner_loads_in_the_other(
     third.load_state_dict(state)
     assert_alike(first, second, rtol=0, atol=0)
     for seed in range(20, 26):
+        if seed == 23:
+            third.anneal(0.1), second.anneal(0.1)
         update_both([third, second], seed)
     assert_alike(third, second)
 
@@ -167,27 +170,6 @@ def test_parameters_that_are_fixed_stay_as_they_are():
         update_both(learners, seed)
     assert_alike(*learners)
     assert weights[0].equal(before)
-
-
-@pytest.mark.parametrize("name", ["ddpg", "td3"])
-@pytest.mark.parametrize("before", [False, UNTRACED], ids=["eager", "compiled"])
-def test_rates_that_are_annealed_after_a_state_is_loaded_are_those_of_the_next_step(name, before):
-    learners = [
-        make_learner(name, critic_lr=1e-2, compile=compile) for compile in (before, False, UNTRACED)
-    ]
-    first, plain, compiled = learners
-    first.anneal(0.3)
-    for seed in range(2):
-        first.update(make_batch(seed=seed))
-    for learner in (plain, compiled):
-        learner.load_state_dict(first.state_dict())
-    update_both([plain, compiled], 2)
-    assert_alike(plain, compiled)
-    for learner in (plain, compiled):
-        learner.anneal(0.0)
-    weights = [weight.detach().clone() for weight in compiled.networks.parameters()]
-    update_both([plain, compiled], 3)
-    assert all(map(torch.equal, weights, compiled.networks.parameters()))
 
 
 def test_networks_that_are_called_with_tensordicts_are_traced_as_well():
