@@ -6,9 +6,8 @@ import copy
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from tests.mpfa.learning import make_batch
-from tests.mpfa.transitions import seeded
 from torchrl_mpfa import (
     DQN,
     Learner,
@@ -20,15 +19,27 @@ from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.networks import make_value_table
 from torchrl_mpfa.selection import SampledBatch
 
-ACTIONS, SIZE, GAMMA, SCALE = 5, 5, 0.9, 0.1
+ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
 
 
 def transitions(count=12, seed=0):
-    batch = make_batch(count, seed=seed, weighted=True)
-    chosen = torch.randint(ACTIONS, (count,), generator=seeded(seed))
-    batch["action"] = torch.nn.functional.one_hot(chosen, ACTIONS)
-    batch["next", "reward"] *= 5
-    return batch
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randint(ACTIONS, (count,), generator=generator)
+    end = torch.rand(count, 1, generator=generator) < 0.3
+    return TensorDict(
+        {
+            "observation": torch.rand(count, SIZE, generator=generator),
+            "action": torch.nn.functional.one_hot(chosen, ACTIONS),
+            "priority_weight": torch.rand(count, generator=generator) + 0.1,
+            "next": {
+                "observation": torch.rand(count, SIZE, generator=generator),
+                "reward": torch.randn(count, 1, generator=generator) * 5,
+                "done": end,
+                "terminated": end,
+            },
+        },
+        [count],
+    )
 
 
 def network(seed=0):
@@ -92,7 +103,7 @@ def test_huber_loss_bends_at_one_in_units_of_the_reward():
 
 
 def cell_of(observation):
-    return (observation[..., 0].sigmoid() * 3).long()
+    return (observation[..., 0] * 3).long()
 
 
 @pytest.mark.parametrize("importance", [True, False])
@@ -178,6 +189,16 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
+def test_ends_that_are_bytes_count_as_booleans(kind):
+    batch, numbers = transitions(), transitions()
+    for key in ("done", "terminated"):
+        numbers["next", key] = numbers["next", key].to(torch.uint8)
+    for each in (batch, numbers):
+        learners()[kind].update(each)
+    assert torch.equal(batch["signals", "td_error"], numbers["signals", "td_error"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
 @pytest.mark.parametrize("form", ["booleans", "floats", "column", "numbers", "column of floats"])
 def test_every_form_of_an_action_is_learned_from_alike(kind, form):
     batch, other = transitions(), transitions()
@@ -222,6 +243,28 @@ def test_bad_action_is_rejected_by_name_and_changes_nothing(kind, spoil):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
+def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
+    learner = learners()[kind]
+    learner.update(transitions(seed=5))  # Values that are not zero.
+    batch = transitions()
+    batch["steps_to_next_obs"] = torch.arange(1, 13).reshape(-1, 1)
+    seen = {"observation": batch["next", "observation"]}
+    with torch.no_grad():
+        best = learner.policy.outputs(seen)["action"]
+        ahead = (learner.targets["value"] if kind == 0 else learner.policy).outputs(seen)
+        ahead = ahead["action_value"]
+        here = learner.policy.outputs({"observation": batch["observation"]})["action_value"]
+    expected = []
+    for row in range(12):
+        value = float(here[row][batch["action"][row].argmax()])
+        goes_on = not bool(batch["next", "terminated"][row])
+        bootstrap = float(ahead[row][best[row].argmax()]) * 0.99 ** (row + 1) * goes_on
+        expected.append(abs(float(batch["next", "reward"][row]) + bootstrap - value))
+    learner.update(batch)
+    assert batch["signals", "td_error"].tolist() == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", [0, 1])
 def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     replay = make_replay(
         "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
@@ -242,7 +285,7 @@ def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
 
 def test_rate_of_a_table_follows_annealing():
     learner = TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
-    row = transitions()[:1].exclude("priority_weight")
+    row = transitions(1).exclude("priority_weight")
     row["next", "reward"][:], row["next", "terminated"][:] = 8.0, True
     for fraction, expected in ((1.0, 4.0), (0.25, 4.0 + 0.125 * 4.0), (0.0, 4.5)):
         learner.anneal(fraction)
