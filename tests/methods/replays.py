@@ -1,20 +1,13 @@
 """Buffers and transitions that the tests of the methods share."""
 
 import torch
-from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer as make_any_buffer
-from tests.mpfa.transitions import seeded
+from tests.mpfa.transitions import make_transitions
 from torchrl_mpfa import SignalTensorStorage
 
 SPREAD = 4.5
 """Standard deviations by which a frequency may miss its probability."""
-
-
-def make_transitions(count, *, seed=0):
-    return TensorDict(
-        {"next": {"reward": torch.randn(count, 1, generator=seeded(seed))}}, batch_size=[count]
-    )
 
 
 def make_buffer(sampler, capacity, batch_size, *, filled=None, seed=0):
@@ -26,18 +19,6 @@ def make_buffer(sampler, capacity, batch_size, *, filled=None, seed=0):
     if filled:
         buffer.extend(make_transitions(filled, seed=seed))
     return buffer
-
-
-def set_signals(buffer, **signals):
-    """Give every filled slot these signals, as a training step would."""
-    count = len(buffer)
-    table = buffer._storage.signal_table
-    data = TensorDict({}, [count])
-    data["index"] = torch.arange(count)
-    data["written_at"] = table.written_at(torch.arange(count))
-    for name, value in signals.items():
-        data["signals", name] = torch.as_tensor(value)
-    buffer.update_tensordict_priority(data)
 
 
 def assert_shares(indices, expected, *, samples):

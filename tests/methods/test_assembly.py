@@ -5,8 +5,7 @@ from dataclasses import dataclass, fields, replace
 import pytest
 import torch
 
-from tests.methods.replays import make_transitions, seeded
-from tests.mpfa.transitions import make_rows
+from tests.mpfa.transitions import make_rows, make_transitions, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.checks import rules_of
 from torchrl_mpfa.methods import (

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import seeded
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa.learners.optimized import make_optimizer
 from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
 

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded
+from tests.methods.replays import assert_shares, make_buffer
+from tests.mpfa.transitions import make_transitions, seeded
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.methods.geometric import GeometricSampler, geometric_age
 

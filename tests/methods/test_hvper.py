@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions, seeded
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, seeded
 from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
+from tests.methods.replays import assert_shares, make_buffer
 from tests.mpfa.test_updates import make_learner
-from tests.mpfa.transitions import make_rows
+from tests.mpfa.transitions import make_rows, make_transitions, seeded, set_signals
 from torchrl_mpfa import SignalSampler, run_updates
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches, uniform_halves

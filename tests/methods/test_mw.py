@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions, set_signals
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, set_signals
 from torchrl_mpfa import Adjustment, FixedFusion, ScaledFusion
 from torchrl_mpfa.methods.mw import MWSampler
 

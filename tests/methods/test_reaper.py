@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import assert_shares, seeded, set_signals
+from tests.methods.replays import assert_shares
+from tests.mpfa.transitions import seeded, set_signals
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.reaper import reliability
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions, seeded
+from tests.methods.replays import make_buffer
 from tests.mpfa.learning import differentiate, make_networks
 from tests.mpfa.test_updates import make_learner
-from tests.mpfa.transitions import make_rows, restore
+from tests.mpfa.transitions import make_rows, make_transitions, restore, seeded
 from torchrl_mpfa import (
     ActorCritic,
     make_actor,

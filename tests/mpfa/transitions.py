@@ -88,6 +88,16 @@ def write_signals(batch, *, seed=0, generator=None):
     return batch
 
 
+def set_signals(buffer, index=None, **signals):
+    """Give slots, by default every filled one, these signals, as a training step would."""
+    slots = torch.arange(len(buffer)) if index is None else torch.as_tensor(index)
+    batch = TensorDict({"index": slots}, [len(slots)])
+    batch["written_at"] = buffer.storage.signal_table.written_at(slots)
+    for name, value in signals.items():
+        batch["signals", name] = torch.as_tensor(value)
+    buffer.update_tensordict_priority(batch)
+
+
 def train_rounds(buffer, rounds, *, seed=0):
     """Sample and update; give everything that was sampled."""
     generator = seeded(seed)

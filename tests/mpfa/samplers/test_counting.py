@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
-from tests.mpfa.transitions import restore
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, restore, seeded, set_signals
 from torchrl_mpfa import Adjustment, PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import make_replay

@@ -9,8 +9,8 @@ from tests.mpfa.transitions import (
     make_buffer,
     make_transitions,
     seeded,
+    set_signals,
     train_rounds,
-    write_signals,
 )
 from torchrl_mpfa import (
     EntropyFusion,
@@ -100,10 +100,7 @@ def test_the_mean_of_the_buffer_reaches_the_boost():
     }
     buffer = make_buffer(4, positive_above="mean", eps=0.0, **parts)
     buffer.extend(make_transitions(4, rewards=[-1.0, -3.0, -5.0, -7.0]))
-    batch = buffer[torch.arange(4)]
-    batch["index"] = torch.arange(4)
-    write_signals(batch)["signals", "td_error"] = torch.ones(4)
-    buffer.update_tensordict_priority(batch)
+    set_signals(buffer, td_error=torch.ones(4), action_gradient=torch.ones(4))
     assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0]
 
 

@@ -15,7 +15,7 @@ from tests.mpfa.transitions import (
     rejected,
     same,
     seeded,
-    write_signals,
+    set_signals,
 )
 from torchrl_mpfa import FixedFusion, SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
@@ -282,10 +282,7 @@ def make_plain(capacity, **kwargs):
 
 
 def update(buffer, index, values):
-    batch = buffer[torch.as_tensor(index)]
-    batch["index"] = torch.as_tensor(index)
-    write_signals(batch)["signals", "td_error"] = torch.as_tensor(values)
-    buffer.update_tensordict_priority(batch)
+    set_signals(buffer, index, td_error=values, action_gradient=torch.ones(len(index)))
 
 
 def test_fresh_rows_do_not_hand_on_their_priority():
