@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import pytest
 import torch
 
-from tests.mpfa.transitions import make_rows, make_transitions, seeded
+from tests.mpfa.transitions import make_rows, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.checks import rules_of
 from torchrl_mpfa.methods import (
@@ -154,18 +154,6 @@ def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
     method = replay.method
     assert betas == [method.beta, (method.beta + method.beta_end) / 2, method.beta_end]
     assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
-
-
-@pytest.mark.parametrize(("floor", "shares"), [(0.0, [5, 0, 0]), (0.2, [5, 1, 1])])
-def test_with_a_floor_all_signals_count_before_the_first_goal(floor, shares):
-    replay = make_replay("mpfa_per", capacity=100, weight_floor=floor)
-    rows = make_transitions(8)
-    rows["next", "reward"] = -torch.arange(1.0, 9.0).unsqueeze(-1)
-    replay.buffer.extend(rows)
-    sampler = replay.buffer.sampler
-    table = replay.buffer.storage.signal_table
-    weights = sampler.fusion.weights(replay.method.signals, table, torch.arange(8))
-    assert weights.tolist() == pytest.approx([share / sum(shares) for share in shares])
 
 
 def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():

@@ -72,17 +72,6 @@ def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
     assert [draw.new_step for draw in draws] == [True, False, False]
 
 
-def test_both_halves_of_the_critics_batch_update_priorities():
-    buffer = make_la3p(400, 64)
-    for draw in la3p_batches(buffer):
-        if not draw.gives_signals:
-            continue
-        draw.batch["signals", "td_error"] = torch.full((len(draw.batch),), 7.0)
-        buffer.update_tensordict_priority(draw.batch)
-        leaves = torch.as_tensor(buffer.sampler._sum_tree[draw.batch["index"]])
-        torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
-
-
 def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)

@@ -15,7 +15,7 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.losses.functional import Trust, trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
-from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
+from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, next_weight
 
 COUNT = 200
 
@@ -30,19 +30,6 @@ def density(action, mean, sigma):
 
 def random_actions(seed, count=COUNT):
     return torch.rand(count, 2, generator=seeded(seed), dtype=torch.double) * 2 - 1
-
-
-def test_ratio_is_that_of_two_densities():
-    action, now, then = (random_actions(seed) for seed in range(3))
-    sigma = torch.rand(COUNT, 1, generator=seeded(3), dtype=torch.double) + 0.2
-    found = importance_ratio(action, now, then, sigma)
-    expected = [
-        density(a, n, s) / density(a, t, s)
-        for a, n, t, (s,) in zip(
-            action.tolist(), now.tolist(), then.tolist(), sigma.tolist(), strict=True
-        )
-    ]
-    assert found.tolist() == pytest.approx(expected)
 
 
 def make_ref_er(learner, rows, **settings):

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.envs.transforms import Compose, RewardScaling
+from torchrl.envs.transforms import RewardScaling
 
 from tests.mpfa.transitions import (
     make_buffer,
@@ -188,19 +188,6 @@ def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
     assert buffer.extend(make_transitions(1)).tolist() == [2]
 
 
-def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
-    transform = Compose(RewardScaling(loc=0.0, scale=10.0, in_keys=[("next", "reward")]))
-    buffer = make_buffer(8, transform=transform)
-    data = make_transitions(8)
-    buffer.extend(data)
-    batch = buffer.sample()
-    scaled = data["next", "reward"][batch["index"]] * 10
-    torch.testing.assert_close(batch["next", "reward"], scaled)
-    buffer.update_tensordict_priority(write_signals(batch))
-    written = data["next", "reward"].squeeze(1)
-    torch.testing.assert_close(buffer.storage.signal_table.rewards.float(), written)
-
-
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
 def test_reading_through_a_transform_does_not_change_the_storage(kind):
     buffer = make_buffer(8, storage=kind(8))
@@ -278,10 +265,3 @@ def test_write_in_place_is_rejected_and_changes_nothing(write):
     buffer = make_filled(8)
     with rejected(buffer, NotImplementedError, r"cannot be changed in place, .* by extend"):
         write(buffer)
-
-
-def test_whole_transition_is_written_in_its_slot_with_its_signals():
-    buffer = make_filled(8)
-    buffer[torch.tensor([2])] = make_transitions(1, rewards=[50.0])
-    assert buffer.rewards()[2] == 50.0
-    assert buffer[2]["next", "reward"] == 50.0

@@ -41,18 +41,6 @@ def test_binary_entropy_of_hand_numbers(first, expected):
     assert math.copysign(1.0, found) == 1.0, "the entropy of a certain event must not be -0.0"
 
 
-def test_reward_entropy_of_a_hand_example():
-    # The average of 10, -1, -1, -1, -2 is 1: one of five lies above it.
-    rewards = torch.tensor([10.0, -1.0, -1.0, -1.0, -2.0])
-    assert float(reward_entropy(rewards)) == pytest.approx(0.7219281)
-
-
-def test_positive_entropy_of_a_hand_example():
-    # Three of four are above zero; the average, which would split them in halves, is not asked.
-    rewards = torch.tensor([9.0, 8.0, 1.0, -2.0])
-    assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_both_entropies_equal_the_oracle(seed):
     # Rounded, so that zeros and ties happen.

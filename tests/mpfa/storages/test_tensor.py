@@ -70,17 +70,6 @@ def test_a_wrap_of_the_ring_resets_exactly_the_rows_it_writes(make_storage):
     torch.testing.assert_close(column(storage, "reward").float(), rewards.abs())
 
 
-def test_adding_one_transition_resets_its_slot(make_storage):
-    storage = make_storage(2)
-    buffer = make_filled(2, storage=storage)
-    fill_signals(storage)
-    assert buffer.add(make_transitions(1, rewards=[-4.0])[0]) == 0
-    assert is_fresh(storage, [0])
-    assert not is_fresh(storage, [1])
-    assert storage.signal_table.rewards[0] == -4.0
-    assert column(storage, "reward")[0] == 4.0
-
-
 @pytest.mark.parametrize(
     ("cursor", "slots"),
     [
