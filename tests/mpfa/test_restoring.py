@@ -9,6 +9,7 @@ import pytest
 import torch
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import ImmutableDatasetWriter, LazyMemmapStorage, LazyTensorStorage
+from torchrl.envs.transforms import RewardScaling
 
 from tests.mpfa.transitions import (
     MISSING,
@@ -222,6 +223,18 @@ def test_wrong_state_is_rejected_and_changes_nothing(pair, path, value, message)
     with rejected(buffer, (KeyError, ValueError, TypeError, RuntimeError), message):
         buffer.load_state_dict(state)
     assert train_rounds(buffer, 3).equal(train_rounds(twin, 3))
+
+
+def test_rejected_load_leaves_the_numbers_of_transforms():
+    first, second = (
+        make_buffer(8, transform=RewardScaling(loc, 1.0, in_keys=[("next", "reward")]))
+        for loc in (0.0, 5.0)
+    )
+    first.extend(make_transitions(8))
+    state = snapshot(first)
+    spoil(state, ("_sampler", "_eps"), MISSING)
+    with rejected(second, KeyError, "'_eps' is missing"):
+        second.load_state_dict(state)
 
 
 @pytest.mark.parametrize(("path", "value", "message"), OF_THE_STORAGE)

@@ -129,3 +129,15 @@ def test_few_rewards_or_rewards_of_both_signs_are_no_reason_for_a_warning(reward
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         train_rounds(buffer, 2)
+
+
+def test_boost_alone_waits_for_rewards_above_a_level_and_not_for_positive_ones():
+    def train(level):
+        fusion = FixedFusion({"td_error": 1.0})
+        buffer = make_buffer(2000, 32, fusion=fusion, positive_above=level)
+        buffer.extend(pendulum())
+        train_rounds(buffer, 1)
+
+    train(1.0)
+    with pytest.warns(UserWarning, match="none of the 1200 rewards in the buffer are above 0"):
+        train(0.0)
