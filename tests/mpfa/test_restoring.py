@@ -279,12 +279,6 @@ def test_folder_with_code_in_it_is_rejected_and_not_executed(file, tmp_path):
     assert not trap.exists()
 
 
-def test_buffer_of_other_signals_is_rejected(pair):
-    other = make_buffer(8, signals=["td_error"])
-    with pytest.raises(ValueError, match=r"must be \['td_error'\], got \['td_error', 'act"):
-        other.load_state_dict(pair[0])
-
-
 @pytest.mark.parametrize("way", ["extend", "load another"])
 def test_state_whose_data_were_overwritten_since_is_rejected(pair, way):
     other, buffer = pair

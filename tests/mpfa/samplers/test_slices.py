@@ -190,15 +190,6 @@ def test_priorities_of_steps_equal_those_without_slices():
     check_leaves(sliced)
 
 
-def test_steps_that_were_overwritten_are_left_out_of_an_update():
-    buffer = filled(batch_size=32)
-    batch = write_signals(buffer.sample())
-    buffer.extend(make_steps(32, 4))
-    buffer.update_tensordict_priority(batch)
-    assert 0 < buffer.stale_updates < 32
-    check_leaves(buffer)
-
-
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
 @READINGS
 def test_loaded_buffer_of_slices_trains_like_the_saved_one(
