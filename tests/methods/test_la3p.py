@@ -70,6 +70,7 @@ def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
     assert [draw.trains for draw in draws] == ["both", "critic", "actor"]
     assert [draw.loss_function for draw in draws][:2] == ["pal", "smooth_l1"]
     assert [draw.new_step for draw in draws] == [True, False, False]
+    assert [draw.gives_signals for draw in draws] == [True, True, False]
 
 
 def test_batch_too_small_for_parts_and_other_sampler_are_rejected():

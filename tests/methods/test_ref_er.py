@@ -9,10 +9,7 @@ from tests.methods.replays import make_buffer
 from tests.mpfa.learning import differentiate, make_networks
 from tests.mpfa.test_updates import make_learner
 from tests.mpfa.transitions import make_rows, make_transitions, restore, seeded
-from torchrl_mpfa import (
-    ActorCritic,
-    make_actor,
-)
+from torchrl_mpfa import ActorCritic, make_actor
 from torchrl_mpfa.losses.functional import Trust, trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, next_weight

@@ -25,15 +25,7 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     run_updates,
 )
-from torchrl_mpfa.checks import (
-    ABOVE_ZERO,
-    BELOW_ONE,
-    COUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    check,
-)
+from torchrl_mpfa.checks import ABOVE_ZERO, BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
 from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.priorities import action_gradient_priority

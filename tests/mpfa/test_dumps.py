@@ -17,20 +17,9 @@ import torch
 from torchrl.data import CompressedListStorage, LazyTensorStorage
 from torchrl.data.replay_buffers import RandomSampler
 
-from tests.mpfa.transitions import (
-    Trap,
-    make_buffer,
-    make_transitions,
-    rejected,
-    same,
-    train_rounds,
-)
+from tests.mpfa.transitions import Trap, make_buffer, make_transitions, rejected, same, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.saving import (
-    MANIFEST,
-    new_dump,
-    open_dump,
-)
+from torchrl_mpfa.saving import MANIFEST, new_dump, open_dump
 
 
 @pytest.fixture

@@ -14,13 +14,7 @@ from tests.mpfa.transitions import (
     train_rounds,
     write_signals,
 )
-from torchrl_mpfa import (
-    MPFASampler,
-    Signal,
-    SignalReplayBuffer,
-    SignalSampler,
-    SignalTensorStorage,
-)
+from torchrl_mpfa import MPFASampler, Signal, SignalReplayBuffer, SignalSampler, SignalTensorStorage
 
 
 @pytest.fixture

@@ -10,10 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from tests.mpfa.transitions import (
-    Trap,
-    same,
-)
+from tests.mpfa.transitions import Trap, same
 from torchrl_mpfa.saving import (
     check_saved_numbers,
     load_safely,

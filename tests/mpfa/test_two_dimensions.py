@@ -9,17 +9,8 @@ from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
-from tests.mpfa.transitions import (
-    make_buffer,
-    make_transitions,
-    rejected,
-    restore,
-    write_signals,
-)
-from torchrl_mpfa import (
-    SignalMemmapStorage,
-    SignalTensorStorage,
-)
+from tests.mpfa.transitions import make_buffer, make_transitions, rejected, restore, write_signals
+from torchrl_mpfa import SignalMemmapStorage, SignalTensorStorage
 
 ENVS, STEPS, CAPACITY = 3, 4, 24
 

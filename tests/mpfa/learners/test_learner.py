@@ -4,13 +4,7 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from tests.mpfa.learning import (
-    KINDS,
-    differentiate,
-    make_batch,
-    make_learner,
-    make_torchrls,
-)
+from tests.mpfa.learning import KINDS, differentiate, make_batch, make_learner, make_torchrls
 from torchrl_mpfa import Learner
 
 

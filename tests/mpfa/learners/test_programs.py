@@ -10,14 +10,7 @@ import torch
 from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
-from tests.mpfa.compiled import (
-    UNTRACED,
-    assert_alike,
-    counting,
-    fail_with,
-    make_pair,
-    update_both,
-)
+from tests.mpfa.compiled import UNTRACED, assert_alike, counting, fail_with, make_pair, update_both
 from tests.mpfa.learning import BOUNDS, make_batch, make_learner, make_networks
 from torchrl_mpfa import ActorCritic
 from torchrl_mpfa.learners import compiled as program

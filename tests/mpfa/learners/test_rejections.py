@@ -9,14 +9,7 @@ import pytest
 import torch
 
 from tests.mpfa import learning
-from tests.mpfa.learning import (
-    KINDS,
-    TRACED,
-    UNTRACED,
-    make_batch,
-    make_discrete,
-    make_networks,
-)
+from tests.mpfa.learning import KINDS, TRACED, UNTRACED, make_batch, make_discrete, make_networks
 from tests.mpfa.transitions import MISSING, rejected, same, snapshot, spoil
 from torchrl_mpfa.selection import SampledBatch
 

@@ -8,9 +8,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
-from tests.mpfa.learning import (
-    make_batch,
-)
+from tests.mpfa.learning import make_batch
 from torchrl_mpfa import ActorCritic, make_actor, make_critic, make_stochastic_actor
 from torchrl_mpfa.networks import ActionScale, action_bounds
 

@@ -5,15 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer, make_transitions, rejected
-from torchrl_mpfa import (
-    REWARD,
-    TD_ERROR,
-    Adjustment,
-    FixedFusion,
-    Fusion,
-    Signal,
-    SignalSampler,
-)
+from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal, SignalSampler
 from torchrl_mpfa.samplers.table import SignalTable
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))

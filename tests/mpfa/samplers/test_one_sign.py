@@ -5,13 +5,7 @@ import warnings
 import pytest
 import torch
 
-from tests.mpfa.transitions import (
-    make_buffer,
-    make_transitions,
-    seeded,
-    set_signals,
-    train_rounds,
-)
+from tests.mpfa.transitions import make_buffer, make_transitions, seeded, set_signals, train_rounds
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,

@@ -15,12 +15,7 @@ from tests.mpfa.transitions import (
     seeded,
     write_signals,
 )
-from torchrl_mpfa import (
-    MPFASampler,
-    Signal,
-    SignalMemmapStorage,
-    SignalTensorStorage,
-)
+from torchrl_mpfa import MPFASampler, Signal, SignalMemmapStorage, SignalTensorStorage
 
 KINDS = ["memory", "memmap", "memmap_scratch"]
 
