@@ -8,7 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mpfa import DQN, Learner, make_value_network, run_updates
+from torchrl_mpfa import (
+    DQN,
+    Learner,
+    make_value_network,
+    run_updates,
+)
 from torchrl_mpfa.learners import TabularQLearner
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.networks import make_value_table
