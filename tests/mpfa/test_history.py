@@ -7,7 +7,11 @@ from tensordict import TensorDict
 from torchrl.data import RandomSampler
 
 from tests.mpfa.transitions import make_buffer
-from torchrl_mpfa import MPFASampler, SignalSampler, SignalTensorStorage
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalSampler,
+    SignalTensorStorage,
+)
 from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
