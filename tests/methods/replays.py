@@ -1,23 +1,16 @@
 """Buffers and transitions that the tests of the methods share."""
 
 import torch
-from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer as make_any_buffer
-from tests.mpfa.transitions import seeded
+from tests.mpfa.transitions import make_transitions
 from torchrl_mpfa import SignalTensorStorage
 
 SPREAD = 4.5
 """Standard deviations by which a frequency may miss its probability."""
 
 
-def make_transitions(count, *, seed=0):
-    return TensorDict(
-        {"next": {"reward": torch.randn(count, 1, generator=seeded(seed))}}, batch_size=[count]
-    )
-
-
-def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, seed=0):
+def make_buffer(sampler, capacity, batch_size, *, filled=None, seed=0):
     """A buffer with this many random transitions."""
     storage = SignalTensorStorage(capacity)
     buffer = make_any_buffer(capacity, batch_size, storage=storage, sampler=sampler, seed=seed)
@@ -28,25 +21,8 @@ def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, see
     return buffer
 
 
-def set_signals(buffer, **signals):
-    """Give every filled slot these signals, as a training step would."""
-    count = len(buffer)
-    table = buffer._storage.signal_table
-    data = TensorDict({}, [count])
-    data["index"] = torch.arange(count)
-    data["written_at"] = table.written_at(torch.arange(count))
-    for name, value in signals.items():
-        data["signals", name] = torch.as_tensor(value)
-    buffer.update_tensordict_priority(data)
-
-
-def frequencies(indices, capacity):
-    counts = torch.bincount(indices, minlength=capacity).double()
-    return counts / counts.sum()
-
-
 def assert_shares(indices, expected, *, samples):
     """The frequencies of slots are their probabilities, as far as chance allows."""
-    found = frequencies(indices, len(expected))
+    found = torch.bincount(indices, minlength=len(expected)).double() / len(indices)
     sigma = (expected * (1 - expected) / samples).sqrt()
     assert ((found - expected).abs() <= SPREAD * sigma + 1e-9).all(), (found, expected)

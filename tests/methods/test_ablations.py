@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from tests import oracles
-from tests.methods.replays import make_buffer, set_signals
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import set_signals
 from torchrl_mpfa.methods import METHODS
 
 REWARDS = [3.0, -1.0, 0.5, 0.5, -2.0, 0.1, 9.0, -0.2]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import pytest
 import torch
 
-from tests.methods.replays import make_transitions, seeded
+from tests.mpfa.transitions import make_rows, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.checks import rules_of
 from torchrl_mpfa.methods import (
@@ -28,24 +28,13 @@ def more(name):
     return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if asks else {}
 
 
-def make_whole_transitions(count):
-    made = make_transitions(count)
-    made["observation"] = torch.randn(count, 6, generator=seeded(1))
-    made["action"] = torch.rand(count, 2, generator=seeded(2)) * 2 - 1
-    made["behavior_mean"] = made["action"] + 0.1
-    made["behavior_sigma"] = torch.full((count, 1), 0.3)
-    made["episode"] = torch.arange(count).unsqueeze(1) // 10
-    made["next", "done"] = made["episode"] < made["episode"].roll(-1)
-    return made
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
     replay = make_replay(name, capacity=64, batch_size=8, generator=seeded(0), **more(name))
     assert isinstance(replay.buffer, SignalReplayBuffer)
     assert replay.method.name == ALIASES.get(name, name) or name in ALIASES
     assert replay.signals == tuple(loss_options(name)["signals"])
-    replay.buffer.extend(make_whole_transitions(64))
+    replay.buffer.extend(make_rows(64, observed=6))
     for _ in range(3):
         draws = 0
         for draw in replay.select(replay.buffer):
@@ -124,9 +113,7 @@ def test_exponent_of_pal_is_that_of_the_method():
         ({"capacity": 0}, "capacity must be an integer from 1 to 2147483647, got 0"),
         ({"batch_size": 2.5}, "batch_size must be an integer from 1 to 2147483647, got 2.5"),
         ({"alpha": -1.0}, "alpha must be finite and not negative, got -1.0"),
-        ({"method": "la3p", "alpha": -1.0}, "alpha must be finite and not negative, got -1.0"),
         ({"method": "lap", "priority_floor": -1}, "priority_floor must be positive and finite"),
-        ({"method": "lap", "priority_floor": NAN}, "priority_floor must be positive .* got nan"),
         ({"method": "hvper", "replay_penalty": -1}, "replay_penalty must be finite and not neg"),
         ({"method": "reaper", "reliability": -1}, "reliability must be positive and finite"),
         ({"boost": "x"}, "boost must be true or false, got 'x'"),
@@ -137,10 +124,7 @@ def test_exponent_of_pal_is_that_of_the_method():
         ({"weight_floor": 1.0}, r"weight_floor must be in \[0, 1\), got 1.0"),
         ({"method": "geometric", "recency": -1}, "recency must be finite and not negative, got -1"),
         ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
-        *[
-            ({"method": "her", "hindsight": value}, "hindsight must be an integer from 0")
-            for value in (-1, True)
-        ],
+        ({"method": "her", "hindsight": -1}, "hindsight must be an integer from 0"),
         ({"method": "reaper", "hindsight": 2}, "hindsight must be 0 with reaper, which .* got 2"),
         ({"method": "klper"}, "method 'klper' needs policy and sigma"),
         ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
@@ -167,18 +151,6 @@ def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
     assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
 
 
-@pytest.mark.parametrize(("floor", "shares"), [(0.0, [5, 0, 0]), (0.2, [5, 1, 1])])
-def test_with_a_floor_all_signals_count_before_the_first_goal(floor, shares):
-    replay = make_replay("mpfa_per", capacity=100, weight_floor=floor)
-    rows = make_transitions(8)
-    rows["next", "reward"] = -torch.arange(1.0, 9.0).unsqueeze(-1)
-    replay.buffer.extend(rows)
-    sampler = replay.buffer.sampler
-    table = replay.buffer.storage.signal_table
-    weights = sampler.fusion.weights(replay.method.signals, table, torch.arange(8))
-    assert weights.tolist() == pytest.approx([share / sum(shares) for share in shares])
-
-
 def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():
     replay = make_replay("per", capacity=100)
     for fraction in (-0.1, 1.1, float("nan")):
@@ -190,15 +162,6 @@ def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():
 @pytest.mark.parametrize("name", ["uniform", "pal", "cer"])
 def test_annealing_without_priorities_does_nothing(name):
     make_replay(name, capacity=100).anneal(1.0)
-
-
-def test_batches_follow_the_generator():
-    def sampled():
-        replay = make_replay("per", capacity=100, batch_size=20, generator=seeded(5))
-        replay.buffer.extend(make_transitions(100))
-        return replay.buffer.sample()["index"]
-
-    assert sampled().equal(sampled())
 
 
 def test_method_with_a_hook_of_0_4_that_nothing_calls_is_rejected():

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions
 from torchrl_mpfa.samplers.uniform import CERSampler
 
 

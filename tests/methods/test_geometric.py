@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded
+from tests.methods.replays import assert_shares, make_buffer
+from tests.mpfa.transitions import make_transitions, seeded
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.geometric import GeometricSampler, geometric_age
 
 SAMPLES = 40_000
@@ -75,18 +75,6 @@ def test_in_two_dimensions_age_goes_along_time_and_the_robots_are_alike():
     time, robot = buffer.sample()["index"].unbind(-1)
     assert_shares(time, shares_of_slots(3.0, [4, 3, 2, 1, 0]), samples=SAMPLES)
     assert (robot.double().mean() - 0.5).abs() < 0.02
-
-
-def test_law_has_one_shape_however_many_transitions_a_run_has():
-    """The oldest tenth against the newest, and the mean age, in a buffer that is hardly filled."""
-    for written in (1_000, 24_000):
-        replay = make_replay("geometric", capacity=100_000, batch_size=SAMPLES)
-        replay.buffer.extend(make_transitions(written))
-        (draw,) = replay.select(replay.buffer)
-        age = (written - 1 - draw.batch["index"]).double() / written
-        newest, oldest = (age < 0.1).double().mean(), (age > 0.9).double().mean()
-        assert newest / oldest == pytest.approx(math.exp(0.9 * 3.0), rel=0.1)
-        assert age.mean() == pytest.approx(1 / 3 - 1 / math.expm1(3), rel=0.03)
 
 
 def test_row_that_was_not_stored_is_not_the_newest():

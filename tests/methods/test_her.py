@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import seeded
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.her import HindsightGoals, future_goals
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions, seeded
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, seeded
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.adjustment import BatchFacts
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -44,7 +44,7 @@ def test_priorities_are_those_of_the_formula(fraction):
         fusion=value_schedule(),
         adjustments=[HVPERPenalty(penalty=KAPPA, floor=EPS)],
     )
-    buffer = make_buffer(sampler, 6, 9, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    buffer = make_buffer(sampler, 6, 9)
     sampler.anneal(fraction)
     batch = buffer.sample()
     # A row for each slot that was sampled, as of a slot that is in a batch twice the last counts.
@@ -71,17 +71,11 @@ def test_value_and_error_are_between_zero_and_one():
             assert ((found >= 0) & (found <= 1)).all()
 
 
-def test_priority_of_equal_transitions_falls_with_their_replays():
-    facts = BatchFacts(torch.zeros(3), torch.tensor([1.0, 10.0, 100.0]), torch.arange(3))
-    found = HVPERPenalty()(torch.full((3,), 0.5), facts)
-    assert found[0] > found[1] > found[2] >= EPS
-
-
 def test_negative_value_is_no_error_as_only_its_place_is_kept():
     sampler = SignalSampler(
         4, 0.6, 0.4, EPS, signals=[RELATIVE_VALUE, RELATIVE_ERROR], fusion=value_schedule()
     )
-    buffer = make_buffer(sampler, 4, 4, filled=0, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    buffer = make_buffer(sampler, 4, 4, filled=0)
     buffer.extend(make_transitions(4))
     batch = buffer.sample()
     batch["signals", "value"] = torch.full((4,), -50.0)
@@ -94,7 +88,7 @@ def relative_errors(batches, errors, *, stale=()):
     signals = [RELATIVE_VALUE, RELATIVE_ERROR]
     count = len(errors)
     sampler = SignalSampler(count, 0.6, 0.4, EPS, signals=signals, fusion=value_schedule())
-    storage = make_buffer(sampler, count, 8, signals=signals).storage
+    storage = make_buffer(sampler, count, 8).storage
     table = storage.signal_table
     slots = torch.arange(count)
     written_at = table.written_at(slots)

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
-from tests.mpfa.test_updates import make_learner, make_rows
+from tests.methods.replays import assert_shares, make_buffer
+from tests.mpfa.test_updates import make_learner
+from tests.mpfa.transitions import make_rows, make_transitions, seeded, set_signals
 from torchrl_mpfa import SignalSampler, run_updates
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches, uniform_halves
@@ -42,13 +43,6 @@ def assert_parts(buffer, errors, *, samples):
         assert_shares(index, expected, samples=samples)
 
 
-def test_parts_are_uniform_by_priority_and_by_its_inverse():
-    errors = torch.rand(15, generator=seeded(3)) * 10
-    buffer = make_la3p(15, 40_000)
-    set_signals(buffer, td_error=errors)
-    assert_parts(buffer, errors, samples=20_000)
-
-
 def test_parts_are_right_after_the_ring_buffer_has_wrapped():
     """The public code looks at the slots before the cursor alone, and misses all others."""
     buffer = make_la3p(15, 40_000)
@@ -76,17 +70,7 @@ def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
     assert [draw.trains for draw in draws] == ["both", "critic", "actor"]
     assert [draw.loss_function for draw in draws][:2] == ["pal", "smooth_l1"]
     assert [draw.new_step for draw in draws] == [True, False, False]
-
-
-def test_both_halves_of_the_critics_batch_update_priorities():
-    buffer = make_la3p(400, 64)
-    for draw in la3p_batches(buffer):
-        if not draw.gives_signals:
-            continue
-        draw.batch["signals", "td_error"] = torch.full((len(draw.batch),), 7.0)
-        buffer.update_tensordict_priority(draw.batch)
-        leaves = torch.as_tensor(buffer.sampler._sum_tree[draw.batch["index"]])
-        torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
+    assert [draw.gives_signals for draw in draws] == [True, True, False]
 
 
 def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
@@ -95,37 +79,6 @@ def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
     with pytest.raises(TypeError, match="buffer must have an LA3PSampler, got SignalSampler"):
         next(la3p_batches(other))
-
-
-def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(monkeypatch):
-    """Errors kept in a list, updated part by part; a spy reads the trees when they are asked."""
-    buffer = make_la3p(60, 20)
-    errors = torch.rand(60, generator=seeded(1)).mul(10).tolist()
-    set_signals(buffer, td_error=errors)
-    sampler, sample = buffer.sampler, buffer.sampler._sample_slots
-    seen = []
-
-    def spy(size, batch_size):
-        slots = torch.arange(60)
-        leaves = [torch.as_tensor(t[slots]) for t in (sampler._sum_tree, sampler._inverse_tree)]
-        seen.append((sampler._part, *leaves))
-        return sample(size, batch_size)
-
-    monkeypatch.setattr(sampler, "_sample_slots", spy)
-    for step in range(20):
-        for number, draw in enumerate(la3p_batches(buffer)):
-            part, leaf, inverse = seen.pop()
-            assert not seen
-            assert part == ("uniform", "prioritized", "inverse")[number]
-            expected = torch.tensor([max(error, 1.0) ** ALPHA for error in errors]).double()
-            torch.testing.assert_close(leaf.double(), expected, rtol=1e-6, atol=0)
-            torch.testing.assert_close(inverse.double(), 1 / expected, rtol=1e-6, atol=0)
-            if draw.gives_signals:
-                values = torch.rand(10, generator=seeded(100 * step + number)) * 10
-                draw.batch["signals", "td_error"] = values
-                buffer.update_tensordict_priority(draw.batch)
-                for slot, value in zip(draw.batch["index"].tolist(), values.tolist(), strict=True):
-                    errors[slot] = value
 
 
 def test_critics_part_finds_the_large_error_that_the_uniform_part_learned():

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer, make_transitions, set_signals
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, set_signals
 from torchrl_mpfa import Adjustment, FixedFusion, ScaledFusion
 from torchrl_mpfa.methods.mw import MWSampler
 
@@ -21,7 +22,7 @@ def make_capped(capacity, batch_size, cap, *, filled=None):
         replay_cap=cap,
         entropy_refresh=0,  # Means are those of the moment.
     )
-    return make_buffer(sampler, capacity, batch_size, filled=filled, signals=SIGNALS)
+    return make_buffer(sampler, capacity, batch_size, filled=filled)
 
 
 def counts_of(buffer):

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.methods.replays import assert_shares, make_buffer, seeded, set_signals
+from tests.methods.replays import assert_shares, make_buffer
+from tests.mpfa.transitions import seeded, set_signals
 from torchrl_mpfa.methods.rank_per import RankPERSampler, rank_share
 
 ALPHA = 0.7

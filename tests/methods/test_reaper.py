@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import assert_shares, seeded, set_signals
+from tests.methods.replays import assert_shares
+from tests.mpfa.transitions import seeded, set_signals
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.reaper import reliability
 
@@ -163,20 +164,6 @@ def test_frequencies_are_those_of_the_product(combined):
     leaves = [r**OMEGA * p**ALPHA for r, p in zip(reliable, priority, strict=True)]
     shares = torch.tensor([leaf / sum(leaves) for leaf in leaves], dtype=torch.double)
     assert_shares(buffer.sample()["index"], shares, samples=60_000)
-
-
-def test_early_error_counts_less_than_the_same_error_at_the_end():
-    """Errors from badly known values to bootstrap from, against errors of a reward alone."""
-    buffer = make_reaper([0] * 50)
-    set_signals(buffer, td_error=torch.ones(50))
-    buffer.extend(make_rows([0], [True]))  # It has ended: the sum is its own.
-    counts = torch.bincount(buffer.sample()["index"], minlength=50).double()
-    assert counts[40:].mean() > 1.5 * counts[1:11].mean()
-    per = make_replay("per", capacity=50, batch_size=60_000, generator=seeded(0)).buffer
-    per.extend(make_rows([0] * 50))
-    set_signals(per, td_error=torch.ones(50))
-    alike = torch.bincount(per.sample()["index"], minlength=50).double()
-    assert alike[40:].mean() < 1.1 * alike[:10].mean()
 
 
 def test_another_alpha_keeps_the_reliabilities():

@@ -6,19 +6,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import make_buffer, make_transitions, seeded
-from tests.mpfa.learning import differentiate
-from tests.mpfa.test_updates import ACTION, OBSERVATION, make_learner, make_rows
-from tests.mpfa.transitions import restore
-from torchrl_mpfa import (
-    ActorCritic,
-    make_actor,
-    make_critic,
-    make_stochastic_actor,
-)
+from tests.methods.replays import make_buffer
+from tests.mpfa.learning import differentiate, make_networks
+from tests.mpfa.test_updates import make_learner
+from tests.mpfa.transitions import make_rows, make_transitions, restore, seeded
+from torchrl_mpfa import ActorCritic, make_actor
 from torchrl_mpfa.losses import trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
-from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
+from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, next_weight
 
 COUNT = 200
 
@@ -33,19 +28,6 @@ def density(action, mean, sigma):
 
 def random_actions(seed, count=COUNT):
     return torch.rand(count, 2, generator=seeded(seed), dtype=torch.double) * 2 - 1
-
-
-def test_ratio_is_that_of_two_densities():
-    action, now, then = (random_actions(seed) for seed in range(3))
-    sigma = torch.rand(COUNT, 1, generator=seeded(3), dtype=torch.double) + 0.2
-    found = importance_ratio(action, now, then, sigma)
-    expected = [
-        density(a, n, s) / density(a, t, s)
-        for a, n, t, (s,) in zip(
-            action.tolist(), now.tolist(), then.tolist(), sigma.tolist(), strict=True
-        )
-    ]
-    assert found.tolist() == pytest.approx(expected)
 
 
 def make_ref_er(learner, rows, **settings):
@@ -170,29 +152,6 @@ def test_weight_starts_near_zero_and_never_leaves_its_range(rate):
     assert next_weight(0.999, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.9 * 0.999 + 0.001)
 
 
-def test_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
-    distances = {}
-    for name, settings in (("ref_er", {"far_share": 0.0}), ("ddpg", {})):
-        learner = make_learner(**loss_options("ref_er"))
-        rows = rows_near_and_far(learner, 0.6)
-        replay = make_replay(
-            name,
-            capacity=COUNT,
-            batch_size=64,
-            policy=learner.policy,
-            generator=seeded(0),
-            **settings,
-        )
-        replay.buffer.extend(rows)
-        for _ in range(150):
-            for draw in replay.select(replay.buffer):
-                learner.update(draw)
-        with torch.no_grad():
-            now = learner.policy(rows.select("observation"))["action"]
-        distances[name] = float((now - rows["behavior_mean"]).square().mean())
-    assert distances["ref_er"] < 0.5 * distances["ddpg"]
-
-
 def test_loss_of_the_actor_is_that_of_the_formula():
     loss, weight, held = (torch.rand(5, generator=seeded(n)) for n in range(3))
     action, mean = (random_actions(n, 5).float() for n in (3, 4))
@@ -210,14 +169,9 @@ def test_loss_of_the_actor_is_that_of_the_formula():
 
 
 def test_sac_is_held_and_set_free_as_well():
-    torch.manual_seed(0)
-    learner = ActorCritic(
-        make_stochastic_actor(OBSERVATION, ACTION, width=8),
-        make_critic(OBSERVATION, ACTION, width=8),
-        signals=[],
-    )
+    learner = ActorCritic(*make_networks(stochastic=True), signals=[])
     rows, found = make_rows(20), []
-    rows["behavior_mean"] = torch.full((20, ACTION), 5.0)
+    rows["behavior_mean"] = torch.full((20, 2), 5.0)
     rows["behavior_sigma"] = torch.ones(20, 1)
     for policy, behavior in ((1.0, 0.0), (0.25, 0.0), (0.0, 1.0)):
         rows["policy_weight"] = torch.full((20,), policy)
@@ -225,7 +179,7 @@ def test_sac_is_held_and_set_free_as_well():
         found.append(float(differentiate(learner, rows, trains="actor")["loss_actor"]))
     assert found[1] == pytest.approx(0.25 * found[0], rel=1e-5)
     # From actions in [-1, 1] it is 4 to 6 to the mean of the behavior.
-    assert ACTION * 4**2 / 2 < found[2] < ACTION * 6**2 / 2
+    assert 4**2 < found[2] < 6**2
 
 
 @pytest.mark.parametrize("way", ["state", "folder"])

@@ -6,8 +6,7 @@ import pickle
 import pytest
 import torch
 
-from tests.methods.replays import make_transitions, seeded
-from tests.mpfa.transitions import MISSING, rejected, restore, same, spoil
+from tests.mpfa.transitions import MISSING, make_transitions, rejected, restore, same, seeded, spoil
 from torchrl_mpfa import MPFASampler, SignalMemmapStorage, make_actor
 from torchrl_mpfa.methods import METHODS as ALL
 from torchrl_mpfa.methods import make_replay

@@ -1,21 +1,17 @@
 """UPER: priorities by what there is to learn from a transition, and not by its noise."""
 
 import math
-from itertools import pairwise
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 from tests.mpfa.learning import KINDS, differentiate, make_apart, make_batch
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import ActorCritic, make_actor, make_critic
-from torchrl_mpfa.learners import actor_critic
+from torchrl_mpfa import ActorCritic, make_actor
 from torchrl_mpfa.learners.networks import QUANTILES
 from torchrl_mpfa.losses import LEAST_NOISE, quantile_loss
-from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -43,15 +39,6 @@ def test_gain_is_that_of_distance_and_disagreement_over_noise():
         assert found[row].item() == pytest.approx(expected)
 
 
-def test_gain_of_single_transitions_equals_a_hand_calculation():
-    # A distance of 2 and a disagreement of 1, over a variance of 4.
-    gain = information_gain_priority(torch.tensor([[1.0], [3.0]]), torch.tensor([[-2.0, 2.0]]))
-    assert gain.item() == pytest.approx(0.5 * math.log(1 + (4 + 1) / 4))
-    certain = information_gain_priority(torch.tensor([[3.0]]), torch.zeros(1, 4), least_noise=1.0)
-    assert certain.item() == pytest.approx(0.5 * math.log(10))
-    assert information_gain_priority(torch.zeros(2, 1), torch.ones(1, 4), least_noise=1.0) == 0
-
-
 def test_quantile_loss_equals_a_loop():
     quantiles, target = torch.randn(6, 5, generator=seeded(1)), torch.randn(6, generator=seeded(2))
     for row, loss in enumerate(quantile_loss(quantiles, target)):
@@ -60,20 +47,6 @@ def test_quantile_loss_equals_a_loop():
             error = (target[row] - quantile).item()
             total += error * ((place + 0.5) / 5 - (error < 0))
         assert loss.item() == pytest.approx(total / 5, abs=1e-6)
-
-
-def test_quantiles_that_minimize_the_loss_have_the_variance_of_the_target():
-    target = 2.0 * torch.randn(4_000, generator=seeded(0)) + 1.0
-    quantiles = torch.zeros(1, QUANTILES, requires_grad=True)
-    optimizer = torch.optim.Adam([quantiles], lr=0.03)
-    for _ in range(600):
-        optimizer.zero_grad()
-        quantile_loss(quantiles.expand(len(target), -1), target).mean().backward()
-        optimizer.step()
-    found = quantiles.detach()[0].tolist()
-    assert all(before < after for before, after in pairwise(found))
-    # Sixteen quantiles leave out the ends of the distribution, a twelfth of its variance.
-    assert 3.4 < quantiles.detach().var(correction=0).item() < 4.1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -127,50 +100,3 @@ def test_critic_whose_last_layer_gives_more_than_q_is_rejected():
     with pytest.raises(ValueError, match="whose last linear layer has one output, got Linear"):
         ActorCritic(make_actor(5, 2), critic, signals=["information_gain"])
     assert "noise" not in ActorCritic(make_actor(5, 2), critic).networks
-
-
-def noisy_share(method, *, rows=1_000, updates=300):
-    """Share of the noisier half of transitions in the batches of a bandit with equal means."""
-    torch.manual_seed(0)
-    generator = seeded(0)
-    observation = torch.rand(rows, 2, generator=generator) * 2 - 1
-    noisy = observation[:, 0] > 0
-    reward = torch.where(noisy, 2.0, 0.3) * torch.randn(rows, generator=generator)
-    end = torch.ones(rows, 1, dtype=torch.bool)
-    after = {"observation": observation, "done": end, "terminated": end}
-    action = torch.zeros(rows, 1)
-    replay = make_replay(method, capacity=rows, batch_size=64, generator=generator)
-    replay.buffer.extend(
-        TensorDict(
-            {
-                "observation": observation,
-                "action": action,
-                "next": {**after, "reward": reward.unsqueeze(-1)},
-            },
-            [rows],
-        )
-    )
-    networks = make_actor(2, 1, width=32), make_critic(2, 1, width=32)
-    learner = ActorCritic(*networks, **loss_options(method), critic_lr=1e-3)
-    found = []
-    for _ in range(updates):
-        for draw in replay.select(replay.buffer):
-            found.append(noisy[draw.batch["index"]].float().mean().item())
-            learner.update(draw)
-            replay.buffer.update_tensordict_priority(draw.batch)
-    later = found[updates // 3 :]
-    return sum(later) / len(later)
-
-
-def test_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
-    assert noisy_share("per") > 0.7
-    assert 0.4 < noisy_share("uper") < 0.57
-    # Without the noise in its denominator it does as PER.
-    monkeypatch.setattr(
-        actor_critic,
-        "information_gain_priority",
-        lambda error, quantiles, *, least_noise: information_gain_priority(
-            error, torch.zeros_like(quantiles), least_noise=least_noise
-        ),
-    )
-    assert noisy_share("uper") > 0.6

@@ -14,7 +14,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mpfa import SignalReplayBuffer, SignalSampler, SignalTensorStorage
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalSampler, SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 
@@ -82,18 +82,6 @@ def test_memory_holds_every_sequence_to_its_end_and_one_reward():
         assert (rows["state"] == state).sum() == 2 ** (LENGTH - state)
 
 
-@pytest.mark.parametrize(
-    ("method", "settings"),
-    [("per", {}), ("rank_per", {}), ("mpfa_per", {"signals": ["reward", "td_error"]})],
-)
-def test_priorities_save_half_of_the_updates(method, settings, of_uniform):
-    generator = torch.Generator().manual_seed(0)
-    replay = make_replay(
-        method, capacity=SIZE, batch_size=4, eps=1e-3, generator=generator, **settings
-    )
-    assert updates_until_known(replay.buffer) < of_uniform / 2
-
-
 class Uniform(SignalSampler):
     """Knows the priorities and does not use them."""
 
@@ -115,13 +103,16 @@ class Reversed(SignalSampler):
         return super()._leaf(1.0 / priority)
 
 
-@pytest.mark.parametrize("kind", [SignalSampler, RankPERSampler, Uniform, Deaf, Reversed])
+@pytest.mark.parametrize(
+    "kind", [SignalSampler, RankPERSampler, MPFASampler, Uniform, Deaf, Reversed]
+)
 def test_only_a_sampler_that_works_saves_half_of_the_updates(kind, of_uniform):
+    options = {"signals": ["reward", "td_error"]} if kind is MPFASampler else {}
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(SIZE),
-        sampler=kind(SIZE, 0.6, 0.4, 1e-3),
+        sampler=kind(SIZE, 0.6, 0.4, 1e-3, **options),
         batch_size=4,
         generator=torch.Generator().manual_seed(0),
     )
-    works = kind in (SignalSampler, RankPERSampler)
+    works = kind not in (Uniform, Deaf, Reversed)
     assert (updates_until_known(buffer, int(of_uniform / 2)) < math.inf) == works

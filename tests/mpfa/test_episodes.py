@@ -37,9 +37,9 @@ class Robot:
         )
 
 
-def make_slices():
+def make_slices(**options):
     sampler = SignalSliceSampler(CAPACITY, 0.6, 0.4, slice_len=LENGTH, signals=["td_error"])
-    return make_buffer(CAPACITY, 100 * LENGTH, sampler=sampler)
+    return make_buffer(CAPACITY, 100 * LENGTH, sampler=sampler, **options)
 
 
 def starts(buffer):
@@ -111,6 +111,20 @@ def test_places_that_are_not_a_number_and_both_zeros_are_alike():
     rows["observation"][3] = 9.0
     number, none = torch.zeros(4), torch.zeros(4, dtype=torch.bool)
     assert episodes_of(rows, torch.arange(4), number, none).tolist() == [0, 0, 0, 3]
+
+
+def test_step_that_begins_where_an_episode_ended_begins_another():
+    last = torch.tensor([False, True, False, False])
+    episodes = episodes_of(Robot(0).steps(4), torch.arange(4), torch.zeros(4), last)
+    assert episodes.tolist() == [0, 0, 2, 2]
+
+
+def test_slices_join_steps_at_a_place_that_is_not_a_number():
+    buffer = make_slices(allow_nonfinite=["observation", ("next", "observation")])
+    rows = Robot(0).steps(4)
+    rows["observation"][1] = rows["next", "observation"][0] = torch.nan
+    buffer.extend(rows)
+    assert (buffer.sampler.batch_weights(4) > 0).tolist() == [True, True, False, False]
 
 
 class KeepEpisode:

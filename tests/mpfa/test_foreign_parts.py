@@ -1,11 +1,10 @@
-"""A sampler in a buffer or storage that is not its own, and names and slots that are none."""
-
-import warnings
+"""Parts of a buffer that are not its own, that do not fit, or that are made at their first use."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.transforms import DoubleToFloat, RewardScaling
 
 from tests.mpfa.transitions import (
     make_buffer,
@@ -98,14 +97,6 @@ def test_signals_follow_each_write_of_two_buffers_that_share_a_storage():
         assert buffer.sampler.table.rewards.float().equal(expected)
 
 
-def test_a_buffer_and_storage_of_ours_need_no_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        buffer = make_filled(16)
-        train_rounds(buffer, 2)
-        buffer.update_priority(torch.tensor([1]), torch.tensor([2.0]))  # By hand, on purpose.
-
-
 def test_a_rejected_update_changes_nothing_at_all():
     """Not even the weights, which were counted before an adjustment failed."""
 
@@ -122,40 +113,80 @@ def test_a_rejected_update_changes_nothing_at_all():
         buffer.update_tensordict_priority(batch)
 
 
-def make_two_dimensional(steps=6, robots=3):
-    number = torch.arange(steps * robots).reshape(steps, robots)
-    sampler = TreeSampler(steps * robots, 1.0, 0.4, 0.0)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(steps * robots, ndim=2),
-        sampler=sampler,
-        batch_size=200,
-        generator=seeded(2),
+# Buffers whose parts are made at their first use.
+
+
+def make_delayed(capacity=16, **kwargs):
+    return SignalReplayBuffer(
+        storage=lambda: SignalTensorStorage(16),
+        sampler=lambda: MPFASampler(capacity),
+        batch_size=4,
+        generator=seeded(),
+        **({"delayed_init": True} | kwargs),
     )
-    buffer.extend(TensorDict({"number": number}, [steps, robots]))
-    return buffer, sampler
 
 
-def test_a_storage_of_two_dimensions_is_sampled_and_updated_as_torchrl_does():
-    buffer, sampler = make_two_dimensional()
-    batch = buffer.sample()
-    assert batch["index"].shape == (200, 2)
-    # TorchRL turns the two dimensions around.
-    assert batch["number"].equal(batch["index"][:, 0] + batch["index"][:, 1] * 3)
-    slots = batch["index"][:, 0] * 6 + batch["index"][:, 1]
-    batch["td_error"] = slots.float() + 1.0
-    buffer.update_tensordict_priority(batch)
-    assert sampler.priorities().tolist() == [float(n + 1) for n in range(18)]
-    place = torch.tensor([2]), torch.tensor([5])
-    sampler.update_priority(place, torch.tensor([7.0]), storage=buffer._storage)
-    assert sampler.priorities()[17] == 7.0
+def test_parts_that_are_made_later_equal_those_made_at_once():
+    now, later = make_buffer(), make_delayed()
+    for buffer in (now, later):
+        buffer.extend(make_transitions(15))
+        buffer.add(make_transitions(1, first=15)[0])
+        buffer.update_tensordict_priority(write_signals(buffer.sample()))
+    assert same(now.state_dict(), later.state_dict())
+    lacking = make_transitions(2).exclude(("next", "reward"))
+    with pytest.raises(KeyError, match="reward"):
+        later.extend(lacking)
 
 
-def test_a_place_outside_a_storage_of_two_dimensions_is_rejected():
-    buffer, sampler = make_two_dimensional()
-    before = sampler.state_dict()
-    # As a number it would be a slot: 0 * 6 + 6.
-    with pytest.raises(IndexError, match=r"within the storage's shape \[3, 6\], got \[0, 6\]"):
-        sampler.update_priority(torch.tensor([[0, 6]]), torch.ones(1), storage=buffer._storage)
-    with pytest.raises(RuntimeError, match="index must have one dimension"):
-        sampler.update_priority(torch.tensor([[0, 6]]), torch.ones(1))
-    assert same(before, sampler.state_dict())
+def test_the_transforms_of_a_factory_act_on_what_is_written_and_sampled():
+    later = make_delayed(
+        delayed_init=None,
+        transform_factory=lambda: RewardScaling(0.0, 10.0, in_keys=[("next", "reward")]),
+    )
+    later.extend(make_transitions(10))
+    batch = later.sample()
+    written = later.rewards()[batch["index"]]
+    torch.testing.assert_close(batch["next", "reward"].flatten().double(), written * 10)
+    later = make_delayed(
+        transform_factory=lambda: DoubleToFloat(
+            in_keys=["observation"], in_keys_inv=["observation"]
+        )
+    )
+    later.add(make_transitions(1)[0])
+    assert later.storage[:]["observation"].dtype is torch.float64
+
+
+def test_any_first_call_makes_the_parts(tmp_path):
+    filled = make_buffer()
+    filled.extend(make_transitions(10))
+    filled.dumps(tmp_path / "buffer")
+    first = {
+        "extend": lambda buffer: buffer.extend(make_transitions(1)),
+        "add": lambda buffer: buffer.add(make_transitions(1)[0]),
+        "empty": lambda buffer: buffer.empty(),
+        "rewards": lambda buffer: buffer.rewards(),
+        "distributions": lambda buffer: buffer.distributions(),
+        "anneal": lambda buffer: buffer.anneal(0.5, 0.5),
+        "state_dict": lambda buffer: buffer.state_dict(),
+        "load_state_dict": lambda buffer: buffer.load_state_dict(snapshot(filled)),
+        "loads": lambda buffer: buffer.loads(tmp_path / "buffer"),
+    }
+    for name, call in first.items():
+        buffer = make_delayed()
+        call(buffer)
+        assert buffer.storage.signal_table is buffer.sampler.table, name
+    with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
+        make_delayed().sample()
+
+
+def test_statistics_do_not_make_the_parts():
+    buffer = make_delayed()
+    assert buffer.stats()["initialized"] is False
+    assert not buffer.initialized
+
+
+def test_parts_that_do_not_fit_are_rejected_at_every_use():
+    buffer = make_delayed(8)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"max_capacity of the sampler is 8, max_size .* 16"):
+            buffer.extend(make_transitions(2))

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests import oracles
-from tests.mpfa.transitions import make_transitions, seeded
-from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion
+from tests.mpfa.transitions import make_filled, make_transitions, seeded, train_rounds
+from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion, ScaledFusion
 from torchrl_mpfa.fusion import (
     binary_entropy,
     entropy_weights,
@@ -15,6 +15,7 @@ from torchrl_mpfa.fusion import (
     positive_entropy,
     reward_entropy,
 )
+from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.samplers import SignalTable
 
 NAMES = ["td_error", "action_gradient", "reward"]
@@ -38,18 +39,6 @@ def test_binary_entropy_of_hand_numbers(first, expected):
     found = float(binary_entropy(torch.tensor(first), torch.tensor(1 - first)))
     assert found == pytest.approx(expected, abs=1e-6)
     assert math.copysign(1.0, found) == 1.0, "the entropy of a certain event must not be -0.0"
-
-
-def test_reward_entropy_of_a_hand_example():
-    # The average of 10, -1, -1, -1, -2 is 1: one of five lies above it.
-    rewards = torch.tensor([10.0, -1.0, -1.0, -1.0, -2.0])
-    assert float(reward_entropy(rewards)) == pytest.approx(0.7219281)
-
-
-def test_positive_entropy_of_a_hand_example():
-    # Three of four are above zero; the average, which would split them in halves, is not asked.
-    rewards = torch.tensor([9.0, 8.0, 1.0, -2.0])
-    assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -145,3 +134,59 @@ def test_fixed_fusion_gives_its_weights_by_name_and_none_to_the_others():
     assert weights.tolist() == pytest.approx([2.0, 0.0, 0.3])
     assert isinstance(FixedFusion(), Fusion)
     assert isinstance(EntropyFusion(), Fusion)
+
+
+# Weights that move with the training or with the scale of the signals.
+
+TWO = ["td_error", "reward"]
+
+
+def make_known_table(rows):
+    """A table of two signals, reward unknown where it is None."""
+    table = SignalTable(10, TWO)
+    table.size = len(rows)
+    for slot, (error, reward) in enumerate(rows):
+        table.rows[slot, table.column["td_error"]] = float("nan") if error is None else error
+        table.rows[slot, table.column["reward"]] = reward
+    return table
+
+
+def test_scheduled_weights_go_in_a_line_from_start_to_end():
+    fusion = ScheduledFusion({"td_error": 1.0}, {"td_error": 0.2, "reward": 0.8})
+    found = []
+    for fraction in (0.0, 0.25, 1.0):
+        fusion.anneal(fraction)
+        found.append(fusion.weights(TWO, None, None).tolist())
+    assert found == [pytest.approx(w) for w in ([1.0, 0.0], [0.8, 0.2], [0.2, 0.8])]
+    assert isinstance(fusion, Fusion)
+
+
+def test_scaled_signals_have_the_shares_that_their_weights_say():
+    table = make_known_table([(1.0, 100.0), (3.0, 300.0), (None, 800.0)])
+    weights = ScaledFusion(FixedFusion(dict.fromkeys(TWO, 1.0))).weights(TWO, table, None)
+    # Means of what is known: 2 and 400.
+    assert weights.tolist() == pytest.approx([1 / 2, 1 / 400])
+
+
+def test_a_signal_without_a_scale_is_not_scaled():
+    table = make_known_table([(None, 0.0), (None, 0.0)])
+    weights = ScaledFusion(FixedFusion(dict.fromkeys(TWO, 1.0))).weights(TWO, table, None)
+    assert weights.tolist() == [1.0, 1.0]
+
+
+def test_scaled_fusion_passes_the_schedule_on():
+    inner = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
+    fusion = ScaledFusion(inner)
+    assert fusion.every_batch
+    fusion.anneal(1.0)
+    assert inner.weights(TWO, None, None).tolist() == [0.0, 1.0]
+    ScaledFusion(FixedFusion()).anneal(0.5)  # Nothing to tell, and no error.
+
+
+def test_sampler_passes_the_schedule_to_its_fusion():
+    fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
+    buffer = make_filled(24, 6, fusion=fusion)
+    for fraction, expected in ((0.0, 1.0), (1.0, 0.0)):
+        buffer.sampler.anneal(fraction)
+        train_rounds(buffer, 1)
+        assert buffer.sampler.weights["td_error"] == pytest.approx(expected)

@@ -66,16 +66,6 @@ def test_bend_with_scaled_rewards_is_at_the_same_error(name):
     torch.testing.assert_close(scaled, 0.01 * plain)
 
 
-@pytest.mark.parametrize("name", ["smooth_l1", "pal"])
-def test_bend_of_each_transition_equals_one_bend_for_all(name):
-    error = torch.randn(20, generator=seeded(1)) * 3
-    bend = torch.full((20,), 0.3)
-    by_row = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=bend)
-    by_all = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=0.3)
-    torch.testing.assert_close(by_row, by_all)
-    assert not torch.allclose(by_row, distance(torch.zeros(2, 20), error.expand(2, 20), name))
-
-
 def test_noise_of_targets_has_its_deviation_and_reaches_both_limits():
     noise = smoothing_noise(torch.zeros(10_000, 2), deviation=0.2, limit=0.5)
     assert (noise.amin().item(), noise.amax().item()) == (-0.5, 0.5)

@@ -1,4 +1,4 @@
-"""Buffers against a model of plain Python, under any sequence of calls, lawful or rejected."""
+"""Buffers against a model of plain Python, under any sequence of calls."""
 
 import shutil
 import tempfile
@@ -18,7 +18,7 @@ from hypothesis.stateful import (
 )
 from tensordict import TensorDict
 
-from tests.mpfa.transitions import make_buffer, rejected, same, snapshot, write_signals
+from tests.mpfa.transitions import make_buffer, same, snapshot, write_signals
 from torchrl_mpfa import SignalMemmapStorage, SignalTensorStorage
 from torchrl_mpfa.saving import load_safely, save_atomically
 
@@ -36,37 +36,6 @@ def make_rows(numbers):
         },
         [len(numbers)],
     )
-
-
-def without(key):
-    return lambda data: data.exclude(key)
-
-
-def with_entry(key, change):
-    return lambda data: data.set(key, change(data[key]))
-
-
-def spoiled(key, value):
-    def change(entry):
-        entry = entry.clone()
-        entry[-1] = value
-        return entry
-
-    return with_entry(key, change)
-
-
-REJECTED = [
-    without("observation"),
-    without(("next", "reward")),
-    without("next"),
-    lambda data: data.set("more", torch.zeros(len(data))),
-    with_entry("observation", lambda entry: entry[:, :1]),
-    with_entry(("next", "reward"), lambda entry: entry.double()),
-    with_entry("done", lambda entry: entry.long()),
-    spoiled("observation", torch.nan),
-    spoiled(("next", "observation"), -torch.inf),
-    spoiled(("next", "reward"), torch.nan),
-]
 
 
 class Replay(RuleBasedStateMachine):
@@ -164,57 +133,6 @@ class Replay(RuleBasedStateMachine):
         load(new)
         assert same(snapshot(self.buffer), snapshot(new))
         self.buffer = new
-
-    @precondition(lambda self: self.slots)
-    @rule(spoil=st.sampled_from(REJECTED), count=st.integers(1, CAPACITY + 2), one=st.booleans())
-    def rejected_extend(self, spoil, count, one):
-        data = spoil(make_rows([99] * count))
-        with rejected(self.buffer, (KeyError, ValueError)):
-            self.buffer.add(data[-1]) if one else self.buffer.extend(data)
-
-    @precondition(lambda self: self.slots)
-    @rule(
-        wrong=st.sampled_from([torch.nan, -1.0, torch.inf]),
-        name=st.sampled_from(["td_error", "action_gradient"]),
-        how=st.sampled_from(["value", "missing", "index", "shape"]),
-    )
-    def rejected_update(self, wrong, name, how):
-        batch = write_signals(self.buffer.sample())
-        if how == "value":
-            batch["signals", name][1] = wrong
-        elif how == "missing":
-            del batch["signals", name]
-        elif how == "index":
-            batch["index"][2] = CAPACITY
-        else:
-            batch["signals", name] = torch.ones(4, 2)
-        with rejected(self.buffer, (KeyError, ValueError, IndexError)):
-            self.buffer.update_tensordict_priority(batch)
-
-    @rule(
-        path=st.sampled_from(
-            [
-                ("_sampler", "_signals", "rows"),
-                ("_sampler", "_signals", "size"),
-                ("_sampler", "_eps"),
-                ("_sampler", "_sum_tree"),
-                ("_writer", "_cursor"),
-                ("_rng",),
-            ]
-        ),
-        value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
-    )
-    def rejected_load(self, path, value):
-        may_be = {"_rng": value is None, "_eps": type(value) is int and value > 0}
-        if may_be.get(path[-1], False):
-            return
-        state = snapshot(self.buffer)
-        place = state
-        for key in path[:-1]:
-            place = place[key]
-        place[path[-1]] = value
-        with rejected(self.buffer, (KeyError, ValueError, TypeError)):
-            self.buffer.load_state_dict(state)
 
     @invariant()
     def the_buffer_holds_what_the_model_holds(self):

@@ -14,13 +14,7 @@ from tests.mpfa.transitions import (
     train_rounds,
     write_signals,
 )
-from torchrl_mpfa import (
-    MPFASampler,
-    Signal,
-    SignalReplayBuffer,
-    SignalSampler,
-    SignalTensorStorage,
-)
+from torchrl_mpfa import MPFASampler, Signal, SignalReplayBuffer, SignalSampler, SignalTensorStorage
 
 
 @pytest.fixture
@@ -117,31 +111,6 @@ def test_an_empty_buffer_cannot_be_sampled_or_updated():
     with pytest.raises(IndexError, match=r"index must be in \[0, 0\)"):
         buffer.update_tensordict_priority(batch)
     assert same(before, snapshot(buffer))
-
-
-@pytest.mark.parametrize("way", ["extend", "add"])
-@pytest.mark.parametrize("start", ["empty", "half full"])
-def test_transitions_without_a_reward_are_rejected_and_leave_no_hole(way, start):
-    # The writer had moved on before the storage rejected: the rows that were rejected stayed
-    # unwritten slots, which were counted as filled once the next transitions came.
-    buffer = make_buffer(8)
-    if start == "half full":
-        buffer.extend(make_transitions(3))
-    before, filled = snapshot(buffer), len(buffer)
-    lacking = make_transitions(2).exclude(("next", "reward"))
-    message = {
-        "empty": r"the transitions lack 'reward': no finite entry at \('next', 'reward'\)",
-        "half full": r"entry \('next', 'reward'\) is missing in the transitions",
-    }
-    with pytest.raises(KeyError, match=message[start]):
-        if way == "extend":
-            buffer.extend(lacking)
-        else:
-            buffer.add(lacking[0])
-    assert same(before, snapshot(buffer))
-    assert buffer.extend(make_transitions(2, first=filled)).tolist() == [filled, filled + 1]
-    assert buffer[:]["observation"].squeeze(1).tolist() == list(range(filled + 2))
-    buffer.sample()
 
 
 NOVELTY = ["td_error", Signal("novelty", key="novelty", known_at="write")]

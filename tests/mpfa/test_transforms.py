@@ -256,11 +256,3 @@ def test_wrong_state_of_unfinished_episodes_is_rejected_and_changes_nothing(wron
     state["_transforms"][name] = wrong
     with rejected(buffer, ValueError, "the saved unfinished episodes must be"):
         buffer.load_state_dict(state)
-
-
-def test_steps_of_several_stop_at_ends_given_as_numbers():
-    for kind in (torch.uint8, torch.int64, torch.float32):
-        buffer, rows = make("n-step"), steps(0, 8, end=4)
-        rows["next", "done"] = rows["next", "done"].to(kind)
-        buffer.extend(rows)
-        assert buffer[:]["next", "observation"].flatten().tolist() == [3, 4, 5, 5, 5]

@@ -5,24 +5,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSliceSampler, SliceSampler
+from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
-from tests.mpfa.transitions import (
-    make_buffer,
-    make_transitions,
-    rejected,
-    restore,
-    same,
-    snapshot,
-    train_rounds,
-    write_signals,
-)
-from torchrl_mpfa import (
-    SignalMemmapStorage,
-    SignalTensorStorage,
-)
+from tests.mpfa.transitions import make_buffer, make_transitions, rejected, restore, write_signals
+from torchrl_mpfa import SignalMemmapStorage, SignalTensorStorage
 
 ENVS, STEPS, CAPACITY = 3, 4, 24
 
@@ -85,6 +73,9 @@ def test_priorities_by_hand_take_places_too():
         slots = torch.tensor([1 * ENVS + 2, 3 * ENVS])
         found = torch.as_tensor(buffer.sampler._sum_tree[slots])
         assert found.tolist() == pytest.approx([7.05**0.6, 9.05**0.6])
+    # As a number it would be a slot: 0 * 3 + 3.
+    with rejected(buffer, IndexError, r"within the storage's shape \[8, 3\], got \[0, 3\]"):
+        buffer.update_priority(torch.tensor([[0, 3]]), torch.ones(1))
 
 
 def test_adding_a_step_of_every_environment_equals_extending_by_it():
@@ -136,22 +127,6 @@ def test_a_batch_from_before_the_buffer_was_emptied_is_stale_in_two_dimensions(s
     assert buffer.stale_updates == 8
 
 
-def test_loaded_buffer_of_two_dimensions_trains_like_the_saved_one(tmp_path):
-    first, second, third = make_deep_buffer(), make_deep_buffer(seed=3), make_deep_buffer(seed=4)
-    first.extend(make_trajectories(steps=6))
-    train_rounds(first, 4)
-    second.load_state_dict(first.state_dict())
-    first.dumps(tmp_path / "buffer")
-    third.loads(tmp_path / "buffer")
-    sampled = []
-    for buffer in (first, second, third):
-        buffer.extend(make_trajectories(9, steps=3))
-        sampled.append(buffer.sample())
-    assert same(snapshot(first), snapshot(second))
-    assert same(sampled[0].to_dict(), sampled[1].to_dict())
-    assert same(sampled[0].to_dict(), sampled[2].to_dict())
-
-
 def test_another_number_of_environments_is_rejected_and_nothing_changes():
     buffer = make_deep_buffer()
     with pytest.raises(ValueError, match=r"max_size must be a multiple of the 5 transitions .* 24"):
@@ -189,22 +164,6 @@ def test_a_collector_of_several_environments_fills_the_buffer(ndim):
 
 
 # TorchRL's own sampler numbers slots of two dimensions in a way that NumPy is about to drop.
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
-@pytest.mark.parametrize("ndim", [1, 2])
-def test_torchrls_slices_are_sampled_from_our_storage(ndim):
-    sampler = PrioritizedSliceSampler(
-        CAPACITY, alpha=0.6, beta=0.4, slice_len=2, end_key=("next", "done"), strict_length=False
-    )
-    buffer = make_buffer(8, 8, storage=SignalTensorStorage(CAPACITY, ndim=ndim), sampler=sampler)
-    data = make_trajectories()
-    data["next", "done"] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
-    data["next", "done"][:, -1] = True
-    index = buffer.extend(data)
-    buffer.update_priority(index, torch.rand(ENVS * STEPS))
-    steps = buffer.sample()["observation"].reshape(-1, 2)
-    assert steps[:, 1].equal(steps[:, 0] + 1)
-
-
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 @pytest.mark.parametrize("way", ["state", "folder"])
 def test_torchrls_slices_of_a_loaded_ring_do_not_cross_its_newest_step(way, tmp_path):

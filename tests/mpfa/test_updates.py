@@ -10,10 +10,10 @@ from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffe
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from tests.mpfa import transitions
-from tests.mpfa.transitions import same, seeded
+from tests.mpfa.second_device import DEVICE
+from tests.mpfa.transitions import make_rows, same, seeded
 from torchrl_mpfa import (
     ActorCritic,
-    MPFASampler,
     PositiveBoost,
     PositiveDecay,
     SignalTensorStorage,
@@ -21,38 +21,16 @@ from torchrl_mpfa import (
     make_critic,
     run_updates,
 )
-from torchrl_mpfa.learners.adam import FlatAdam
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
 from torchrl_mpfa.selection import SampledBatch, one_batch
 
-OBSERVATION, ACTION = 5, 2
 MANY, BATCH, UPDATES = 4000, 16, 4
-
-
-def make_rows(count, seed=0):
-    def normal(size):
-        return torch.randn(count, size, generator=generator)
-
-    generator = seeded(seed)
-    end = torch.zeros(count, 1, dtype=torch.bool)
-    after = {"observation": normal(OBSERVATION), "reward": normal(1)}
-    return TensorDict(
-        {
-            "observation": normal(OBSERVATION),
-            "action": normal(ACTION).tanh(),
-            "episode": torch.arange(count).unsqueeze(1) // 10,
-            "behavior_mean": normal(ACTION).tanh(),
-            "behavior_sigma": torch.full((count, 1), 0.3),
-            "next": {**after, "done": end, "terminated": end.clone()},
-        },
-        [count],
-    )
 
 
 def make_learner(**options):
     torch.manual_seed(0)
-    actor = make_actor(OBSERVATION, ACTION, width=8)
-    critic = make_critic(OBSERVATION, ACTION, width=8)
+    actor = make_actor(5, 2, width=8)
+    critic = make_critic(5, 2, width=8)
     return ActorCritic(actor, critic, actor_lr=1e-2, critic_lr=1e-2, **options)
 
 
@@ -96,8 +74,10 @@ class Counting:
         return {"loss_value": torch.tensor(float(self.updates))}
 
 
-def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
-    ours, theirs = make_buffer(), make_buffer()
+@pytest.mark.parametrize("position", ["batch", "rank", "count"])
+def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait(position):
+    adjustments = PositiveBoost(), PositiveDecay(position=position)
+    ours, theirs = (make_buffer(adjustments=adjustments) for _ in range(2))
     first, second = make_learner(), make_learner()
     for _ in range(3):
         log, batch = run_updates(ours, first, updates=UPDATES)
@@ -107,20 +87,6 @@ def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
     assert same(first.state_dict(), second.state_dict())
     assert same(ours.state_dict(), theirs.state_dict())
     assert first.updates == 3 * UPDATES
-
-
-def test_one_call_samples_and_one_writes(monkeypatch):
-    calls = []
-    for name in ("sample", "update_signals"):
-        method = getattr(MPFASampler, name)
-
-        def spy(self, *args, name=name, method=method, **kwargs):
-            calls.append(name)
-            return method(self, *args, **kwargs)
-
-        monkeypatch.setattr(MPFASampler, name, spy)
-    run_updates(make_buffer(), make_learner(), updates=UPDATES)
-    assert calls == ["sample", "update_signals"]
 
 
 class OneBatch(PositiveBoost):
@@ -138,33 +104,6 @@ def test_an_own_adjustment_of_one_batch_gets_them_one_by_one_and_the_same_number
         run_updates(buffer, make_learner(), updates=UPDATES)
         found.append(buffer.sampler.priorities())
     assert same(*found)
-
-
-def test_a_round_follows_a_change_of_an_option_and_looks_for_it_once(monkeypatch):
-    looks, found = [], []
-    holds = FlatAdam.holds
-    monkeypatch.setattr(FlatAdam, "holds", lambda self: looks.append(1) or holds(self))
-    for changed in (False, True):
-        learner, buffer = make_learner(compile={"disable": True}), make_buffer()
-        run_updates(buffer, learner, updates=UPDATES)
-        looks.clear()
-        learner.saturation_penalty = 5.0 * changed
-        learner.saturation_limit = 0.0
-        found.append(run_updates(buffer, learner, updates=UPDATES)[0]["loss_actor"])
-        assert len(looks) == 1
-    assert not same(*found)
-
-
-@pytest.mark.parametrize("position", ["batch", "rank", "count"])
-def test_each_batch_has_places_and_a_mean_of_its_own(position):
-    ours = make_replay(
-        capacity=MANY, batch_size=BATCH, generator=seeded(1), decay_position=position
-    ).buffer
-    ours.extend(make_rows(MANY))
-    theirs = copy.deepcopy(ours)
-    run_updates(ours, make_learner(), updates=UPDATES)
-    run_loop(theirs, make_learner(), UPDATES)
-    assert same(ours.sampler.priorities(), theirs.sampler.priorities())
 
 
 def test_of_a_transition_that_was_sampled_twice_the_last_update_counts():
@@ -308,21 +247,6 @@ def test_batches_are_prepared_before_the_learner_gets_them(updates):
     assert bool((written == updates).all())
 
 
-def test_prepared_batches_of_a_round_are_learned_from_at_once_by_the_program(monkeypatch):
-    found = []
-    for prepare in (None, lambda sampled: replace(sampled, batch=sampled.batch.copy())):
-        buffer, learner = make_buffer(), make_learner(compile={"disable": True})
-        log, batch = run_updates(buffer, learner, updates=UPDATES, prepare=prepare)
-        assert learner.updates == UPDATES
-        found.append((log, batch.to_dict(), learner.state_dict(), buffer.state_dict()))
-    assert same(*found)
-    # One step after the other is what the program does by itself.
-    monkeypatch.setattr(ActorCritic, "_step", None)
-    learner = make_learner(compile={"disable": True})
-    run_updates(make_buffer(), learner, updates=UPDATES, prepare=lambda sampled: sampled)
-    assert learner.updates == UPDATES
-
-
 def test_prepare_gets_the_batches_of_a_round_together_with_their_number():
     learner, seen = Counting(), []
 
@@ -399,3 +323,40 @@ def test_rows_that_make_no_equal_batches_are_rejected():
     with pytest.raises(ValueError, match="16 slots cannot make 3 equal batches"):
         buffer.update_tensordict_priority(batch, batches=3)
     assert same(buffer.sampler.priorities(), before)
+
+
+# Batches, signals and learner on different devices.
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+@pytest.mark.parametrize(("home", "away"), [("cpu", DEVICE), (DEVICE, DEVICE), (DEVICE, "cpu")])
+@pytest.mark.usefixtures("second_device")
+def test_batches_go_to_the_device_of_the_learner_and_signals_come_back(updates, home, away):
+    home, away = torch.device(home), torch.device(away)
+    learner, buffer = Counting(), make_buffer(device=home)
+    _, batch = run_updates(
+        buffer,
+        learner,
+        updates=updates,
+        prepare=lambda draw: replace(draw, batch=draw.batch.to(away)),
+    )
+    assert all(each.device == away for each in learner.batches)
+    assert batch.device == home
+    table = buffer.storage.signal_table
+    assert table.rows.device == buffer.sampler.priorities().device == home
+    assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
+    # What has no device of its own stands for another one, which not every machine has.
+    learner, buffer = Counting(), make_buffer()
+
+    def prepare(draw):
+        return replace(draw, batch=TensorDict(draw.batch.to_dict(), [len(draw.batch)]))
+
+    _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
+    assert all(each.device is None for each in learner.batches)
+    assert batch.device == torch.device("cpu")
+    table = buffer.storage.signal_table
+    assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())

@@ -39,22 +39,6 @@ def test_signals_are_those_of_our_learner_with_the_same_networks(kind, order):
         torch.testing.assert_close(second["signals", name], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_td_error_of_a_pair_of_critics_is_the_larger_one_and_the_slope_the_first_one_s():
-    actor, critic = make_networks()
-    loss = TD3Loss(actor, critic, loss_function="l2", num_qvalue_nets=2, **QUIET)
-    loss.make_value_estimator(gamma=0.99)
-    batch = make_batch(16)
-    loss(batch)
-    write_signals(batch, loss)
-    assert batch["signals", "td_error"].square().allclose(batch["td_error"].reshape(-1), atol=1e-6)
-    inputs = batch.select("observation", "action")
-    action = inputs["action"].requires_grad_()
-    with loss.qvalue_network_params[0].detach().to_module(loss.qvalue_network):
-        value = loss.qvalue_network(inputs)["state_action_value"]
-    slope = torch.autograd.grad(value.sum(), action)[0].norm(dim=-1)
-    torch.testing.assert_close(batch["signals", "action_gradient"], slope)
-
-
 def test_td_error_that_a_part_of_a_loss_returns_is_written_by_hand():
     actor, critic = make_networks()
     loss = TD3Loss(actor, critic, loss_function="l2", num_qvalue_nets=2, **QUIET)

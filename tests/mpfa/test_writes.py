@@ -162,14 +162,6 @@ def test_wrong_transitions_are_rejected_by_name_and_change_nothing(buffer, name,
     assert same(twin.sample(), buffer.sample())
 
 
-def test_written_data_equal_those_of_torchrl(buffer):
-    index = buffer.extend(make_full_transitions(2, 9.0))
-    found = buffer[index].exclude("index")
-    assert same(found.to_dict(), make_full_transitions(2, 9.0).to_dict())
-    assert len(buffer) == CAPACITY
-    assert buffer[:]["index"].tolist() == list(range(CAPACITY))
-
-
 @pytest.mark.parametrize("kind", [TreeSampler, MPFASampler])
 def test_a_rejected_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kind):
     writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))

@@ -30,6 +30,28 @@ def make_transitions(count, *, seed=0, first=0, rewards=None):
     )
 
 
+def make_rows(count, *, seed=0, observed=5, length=10):
+    """Transitions with all that any method asks for, in episodes of this length."""
+    generator, number = seeded(seed), torch.arange(count).unsqueeze(1)
+
+    def normal(size):
+        return torch.randn(count, size, generator=generator)
+
+    after = {"observation": normal(observed), "reward": normal(1)}
+    after |= {"done": number % length == length - 1, "terminated": torch.zeros_like(number).bool()}
+    return TensorDict(
+        {
+            "observation": normal(observed),
+            "action": normal(2).tanh(),
+            "episode": number // length,
+            "behavior_mean": normal(2).tanh(),
+            "behavior_sigma": torch.full((count, 1), 0.3),
+            "next": after,
+        },
+        [count],
+    )
+
+
 _OF_BUFFER = {"transform", "transform_factory", "writer", "priority_key", "allow_nonfinite"}
 
 
@@ -64,6 +86,16 @@ def write_signals(batch, *, seed=0, generator=None):
         [count],
     )
     return batch
+
+
+def set_signals(buffer, index=None, **signals):
+    """Give slots, by default every filled one, these signals, as a training step would."""
+    slots = torch.arange(len(buffer)) if index is None else torch.as_tensor(index)
+    batch = TensorDict({"index": slots}, [len(slots)])
+    batch["written_at"] = buffer.storage.signal_table.written_at(slots)
+    for name, value in signals.items():
+        batch["signals", name] = torch.as_tensor(value)
+    buffer.update_tensordict_priority(batch)
 
 
 def train_rounds(buffer, rounds, *, seed=0):

@@ -23,20 +23,6 @@ def target_of(learner, batch, seed=7):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_with_one_critic_every_step_is_the_same_as_without_averaging(kind):
-    averaged, plain = make_learner(kind, 1), make_learner(kind, 1)
-    plain.end_episode = lambda: None
-    for seed in range(4):
-        for learner in (averaged, plain):
-            torch.manual_seed(seed)
-            learner.update(make_batch(seed=seed))
-            learner.end_episode()
-    for name in ("networks", "targets"):
-        states = [learner.state_dict()[name].values() for learner in (averaged, plain)]
-        assert all(torch.equal(mine, other) for mine, other in zip(*states, strict=True))
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_target_is_the_mean_over_the_present_and_the_earlier_critics(kind):
     learner, batch = make_learner(kind, 3), make_batch(seed=20)
     states = []

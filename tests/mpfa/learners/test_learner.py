@@ -4,13 +4,7 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from tests.mpfa.learning import (
-    KINDS,
-    differentiate,
-    make_batch,
-    make_learner,
-    make_torchrls,
-)
+from tests.mpfa.learning import KINDS, differentiate, make_batch, make_learner, make_torchrls
 from torchrl_mpfa import Learner
 
 
@@ -83,28 +77,6 @@ def test_actor_and_critic_learn_at_their_own_rates(kind):
     rates = {id(p): g["lr"] for g in learner.optimizer.param_groups for p in g["params"]}
     assert {rates[id(p)] for p in learner.networks["actor"].parameters()} == {1e-4}
     assert {rates[id(p)] for p in learner.networks["critics"].parameters()} == {2e-3}
-
-
-def test_critic_is_not_moved_by_the_loss_of_the_actor():
-    learner = make_learner(critic_weight_decay=0.0)
-    before = {name: p.detach().clone() for name, p in learner.networks.named_parameters()}
-    batch = make_batch()
-    # A batch of which nothing counts for the critic: errors of zero are the least to divide by.
-    batch["priority_weight"] = torch.zeros(6)
-    learner.update(batch)
-    for name, value in learner.networks.named_parameters():
-        if name.startswith("critics"):
-            torch.testing.assert_close(value, before[name], rtol=0, atol=1e-12)
-        else:
-            assert not value.equal(before[name])
-
-
-def test_update_writes_the_signals_and_gives_detached_values():
-    batch = make_batch()
-    values = make_learner().update(batch)
-    assert {"loss_value", "loss_actor"} <= set(values)
-    assert not any(value.requires_grad for value in values.values())
-    assert batch["signals"].batch_size == (6,)
 
 
 @pytest.mark.parametrize("kind", ["ddpg", "td3"])

@@ -8,9 +8,8 @@ from tensordict import TensorDict
 
 from tests.mpfa import learning
 from tests.mpfa.learning import make_batch, make_networks
-from tests.mpfa.transitions import make_buffer, seeded
-from torchrl_mpfa import ActorCritic, Learner
-from torchrl_mpfa.selection import SampledBatch
+from tests.mpfa.transitions import seeded
+from torchrl_mpfa import ActorCritic
 
 
 def make_learner(seed=0, **options):
@@ -49,15 +48,6 @@ def test_update_moves_everything_and_only_the_critics_have_targets():
     assert list(learner.targets) == ["critics"]
 
 
-def test_temperature_moves_with_the_actor():
-    learner = make_learner()
-    found = [learner.networks["temperature"]["log"].item()]
-    for trains in ("critic", "actor"):
-        learner.update(SampledBatch(make_batch(), trains=trains))
-        found.append(learner.networks["temperature"]["log"].item())
-    assert found[0] == found[1] != found[2]
-
-
 def test_temperature_has_a_rate_of_its_own_that_is_annealed_too():
     learner = make_learner()
     for fraction in (0.25, 0.5):  # Of the first rates, and not of the present ones.
@@ -91,14 +81,3 @@ def test_learning_finds_the_best_action_at_the_entropy_that_is_asked_for():
 @pytest.mark.parametrize("rate", ["actor_lr", "critic_lr"])
 def test_learning_without_one_of_the_networks_does_not_find_it(rate):
     assert solve_bandit(**{rate: 1e-9})[0] > 0.3
-
-
-def test_signals_of_sac_are_read_by_a_replay_of_several_signals():
-    buffer, learner = make_buffer(16, 8), make_learner()
-    buffer.extend(make_batch(16))
-    for _ in range(3):
-        batch = buffer.sample()
-        learner.update(batch)
-        buffer.update_tensordict_priority(batch)
-    assert set(buffer.sampler.weights) == {"reward", "td_error", "action_gradient"}
-    assert isinstance(learner, Learner)

@@ -15,7 +15,6 @@ from tests.mpfa.learning import (
     make_torchrls,
 )
 from tests.mpfa.transitions import same
-from torchrl_mpfa.losses import smoothing_noise
 
 # TorchRL warns at every loss of its own whose target networks nothing moves.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -67,48 +66,6 @@ def test_targets_of_several_steps_are_those_of_torchrls_loss(kind, options, colu
     assert log["target_value"].equal(targets_of(learner, batch))
     one_step = targets_of(learner, batch.exclude("steps_to_next_obs"))
     assert not torch.allclose(one_step, log["target_value"])
-
-
-@pytest.mark.parametrize("kind", ["ddpg", "td3"])
-def test_target_of_several_steps_is_its_formula_row_by_row(kind):
-    batch, learner = of_several_steps(done_keys=["done"]), make_apart(kind, gamma=GAMMA)
-    found = targets_of(learner, batch)
-    torch.manual_seed(3)
-    noise = torch.zeros(len(batch), 2)
-    if kind == "td3":
-        noise = smoothing_noise(noise, deviation=learner.policy_noise, limit=learner.noise_clip)
-    for row in range(len(batch)):
-        after = batch["next"][row]
-        action = learner.targets["actor"].module(after["observation"])[1] + noise[row]
-        action = action.clamp(-1.0, 1.0)
-        critics = learner.targets["critics"]
-        value = min(float(q.module(after["observation"], action)) for q in critics)
-        expected = float(after["reward"])
-        if not bool(after["terminated"]):
-            expected += GAMMA ** int(batch["steps_to_next_obs"][row]) * value
-        assert float(found[row]) == pytest.approx(expected, abs=1e-6)
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_target_of_sac_is_soft_row_by_row(scale):
-    learner = make_apart("sac", reward_scale=scale)
-    batch = make_batch()
-    found = targets_of(learner, batch)
-    torch.manual_seed(3)
-    noise = torch.randn(6, 2)
-    for row in range(6):
-        after = batch["next", "observation"][row]
-        loc, deviation = learner.policy.module[0].module(after)
-        normal = torch.distributions.Normal(loc, deviation)
-        before = loc + deviation * noise[row]
-        action = before.tanh()
-        log_density = sum(normal.log_prob(before) - (1 - action.square()).log())
-        values = [float(q.module(after, action)) for q in learner.targets["critics"]]
-        target = scale * float(batch["next", "reward"][row])
-        if row != 1:  # The second transition is an end, the third a time limit.
-            target += 0.9 * (min(values) - 0.3 * float(log_density))
-        assert float(found[row]) == pytest.approx(target, rel=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32], ids=str)

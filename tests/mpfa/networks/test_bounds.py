@@ -1,7 +1,5 @@
 """Bounds of actions: from a spec to the networks and to the losses."""
 
-import math
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,14 +8,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
-from tests.mpfa.learning import (
-    differentiate,
-    gradients_of,
-    gradients_of_torchrls,
-    make_apart,
-    make_batch,
-    make_torchrls,
-)
+from tests.mpfa.learning import make_batch
 from torchrl_mpfa import ActorCritic, make_actor, make_critic, make_stochastic_actor
 from torchrl_mpfa.networks import ActionScale, action_bounds
 
@@ -132,48 +123,6 @@ def test_random_actions_have_the_density_of_torchrls_distribution():
     with set_exploration_type(ExplorationType.RANDOM):
         sampled = policy(TensorDict(inputs, [50]))["action"]
     assert bool(((sampled >= torch.tensor(LOW)) & (sampled <= torch.tensor(HIGH))).all())
-
-
-def test_density_integrates_to_one():
-    policy = make_stochastic_actor(1, 1, action_spec=Bounded(low=0.0, high=10.0, shape=(1,)))
-    scale = policy.action_scale
-    # Of a standard normal, at the actions of a grid: sum the density of equal steps of action.
-    action = torch.linspace(0.01, 9.99, 2001, dtype=torch.double)
-    before = torch.atanh((action - 5.0) / 5.0)
-    normal = torch.distributions.Normal(0.0, 1.0).log_prob(before)
-    jacobian = torch.log1p(-before.tanh().square()) + scale.half_width.double().log()
-    total = float((normal - jacobian).exp().sum() * (action[1] - action[0]))
-    assert total == pytest.approx(1.0, abs=1e-2)
-    torch.manual_seed(0)
-    sampled, log_density, loc = policy.sample({"observation": torch.zeros(1000, 1)})
-    deviation = policy.module[0].outputs({"observation": torch.zeros(1000, 1)})["scale"]
-    at = torch.atanh((sampled - 5.0) / 5.0)
-    expected = torch.distributions.Normal(loc, deviation).log_prob(at)
-    expected = (expected - torch.log1p(-at.tanh().square()) - math.log(5.0)).sum(-1)
-    inside = at.squeeze(-1).abs() < 2
-    torch.testing.assert_close(log_density[inside], expected[inside], rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("kind", ["td3", "sac"])
-def test_losses_equal_torchrls_within_these_bounds(kind):
-    options, bounds = {"importance": "torchrl"}, {}
-    if kind == "td3":
-        noise = {"policy_noise": 2.0, "noise_clip": 3.0}
-        options |= {"bounds": SPEC, **noise}
-        bounds = {"bounds": None, "action_spec": SPEC, **noise}
-    maker = make_actor if kind == "td3" else make_stochastic_actor
-    learner = make_apart(kind, networks=networks(maker), **options)
-    loss = make_torchrls(kind, learner, **bounds)
-    log = differentiate(learner, batch := batch_of())
-    torch.manual_seed(1)
-    losses = loss(batch.exclude("signals", "td_error"))
-    sum(value for key, value in losses.items() if key.startswith("loss")).backward()
-    names = {"loss_value": "loss_qvalue", "loss_actor": "loss_actor"}
-    for ours, theirs in names.items():
-        torch.testing.assert_close(log[ours], losses[theirs].detach(), rtol=1e-4, atol=1e-4)
-    gradients = gradients_of(learner)
-    for name, gradient in gradients_of_torchrls(kind, loss).items():
-        torch.testing.assert_close(gradients[name], gradient, rtol=1e-3, atol=1e-4, msg=name)
 
 
 def test_learners_train_within_bounds_and_move_no_bound():

@@ -57,15 +57,6 @@ def test_shares_are_of_the_last_batch_after_its_update(trained):
     assert sum(stats[f"share/{name}"] for name in NAMES) == pytest.approx(1.0)
 
 
-def test_fractions_of_positive_transitions(trained):
-    buffer, batch = trained
-    stats = buffer.stats()
-    everything = buffer[:]["next", "reward"].squeeze(1).tolist()
-    sampled = batch["next", "reward"].squeeze(1).tolist()
-    assert stats["positive_fraction_buffer"] == sum(r > 0 for r in everything) / 24
-    assert stats["positive_fraction_batch"] == sum(r > 0 for r in sampled) / 12
-
-
 @pytest.mark.parametrize("level", [-1.0, "mean"])
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_fractions_of_positive_transitions_are_above_the_level_of_the_sampler(level):

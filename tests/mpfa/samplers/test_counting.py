@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
-from tests.mpfa.transitions import restore
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import make_transitions, restore, seeded, set_signals
 from torchrl_mpfa import Adjustment, PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import make_replay
@@ -164,33 +164,3 @@ def test_of_equal_priorities_the_positive_ones_get_the_share_that_is_wanted(targ
         phi = float(adaptive_boost(torch.tensor(positive / 100), target=target, highest=1e9))
         found = positive * phi / (positive * phi + 100 - positive)
         assert found == pytest.approx(max(target, positive / 100), rel=1e-5)
-
-
-def test_phi_falls_as_goals_fill_the_buffer_and_stays_within_its_bounds():
-    found = [
-        float(adaptive_boost(torch.tensor(n / 1000.0), target=0.5, highest=10.0))
-        for n in range(1001)
-    ]
-    assert found == sorted(found, reverse=True)
-    assert found[0] == 10.0
-    assert found[500] == found[1000] == 1.0
-    assert 1.0 < found[200] < 10.0
-
-
-def share_of_goals(name, goals):
-    """Share of a batch that are goals, of which a buffer of 2,000 has this many."""
-    replay = make_replay(
-        name, capacity=2000, batch_size=20_000, generator=seeded(0), positive_above=1.0
-    )
-    rewards = torch.full((2000, 1), -0.1)
-    rewards[:goals] = 1.1  # Above the level, and hardly larger than others.
-    replay.buffer.extend(TensorDict({"next": {"reward": rewards}}, [2000]))
-    known = {"td_error": torch.ones(2000), "action_gradient": torch.ones(2000)}
-    for _ in range(2):
-        set_signals(replay.buffer, **known)
-    return float((replay.buffer.sample()["index"] < goals).double().mean())
-
-
-def test_an_adaptive_boost_favors_rare_goals_over_common_ones():
-    assert share_of_goals("mpfa_adaptive", 40) > 1.5 * share_of_goals("mpfa_per", 40)
-    assert share_of_goals("mpfa_adaptive", 1200) < share_of_goals("mpfa_per", 1200)

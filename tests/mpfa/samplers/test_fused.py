@@ -4,16 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same
-from torchrl_mpfa import (
-    REWARD,
-    TD_ERROR,
-    Adjustment,
-    FixedFusion,
-    Fusion,
-    Signal,
-    SignalSampler,
-)
+from tests.mpfa.transitions import make_buffer, make_transitions, rejected
+from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal, SignalSampler
 from torchrl_mpfa.samplers.table import SignalTable
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
@@ -79,35 +71,6 @@ def test_own_signals_go_from_the_batch_to_the_priority():
     update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
     # 4/4 + 2/2 + 2^2/4 and 0 + 6/2 + 3^2/4
     assert priorities(buffer)[2:4] == pytest.approx([3.0, 5.25])
-
-
-def test_own_signals_show_in_the_statistics():
-    buffer = make_own_buffer()
-    buffer.extend(make_own_transitions(8))
-    buffer.sample()
-    update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
-    stats = buffer.stats()
-    assert stats["weight/novelty"] == pytest.approx(0.5)
-    assert stats["weight/reward"] == 0.0
-
-
-def test_own_signals_are_saved_and_loaded(tmp_path):
-    first, second = make_own_buffer(), make_own_buffer()
-    first.extend(make_own_transitions(6))
-    update(first, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
-    first.dumps(tmp_path)
-    second.loads(tmp_path)
-    assert same(first.storage.signal_table.state_dict(), second.storage.signal_table.state_dict())
-    assert first.sample()["index"].equal(second.sample()["index"])
-
-
-def test_an_own_learned_signal_that_is_missing_is_named():
-    buffer = make_own_buffer()
-    buffer.extend(make_own_transitions(8))
-    batch = buffer.sample()
-    batch["signals"] = TensorDict({"td_error": torch.ones(4)}, [4])
-    with pytest.raises(KeyError, match=r"signal 'novelty' is missing: .*'curiosity', 'novelty'"):
-        buffer.update_tensordict_priority(batch)
 
 
 def test_transitions_without_an_own_signal_are_rejected():

@@ -1,5 +1,6 @@
 """The index of a batch in all its forms: read, or rejected by name before anything changes."""
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -76,6 +77,7 @@ WRONG = {
     "text": "ab",
     "mapping": {},
     "mask": torch.ones(2, dtype=torch.bool),
+    "mask of NumPy": np.array([True, False]),
     "floats": torch.tensor([0.5, 1.0]),
     "numbers of floats in a tuple": (torch.tensor([0.5]), torch.tensor([1.0])),
     "tensordicts in a tuple": (TensorDict({}, [2]), TensorDict({}, [2])),

@@ -5,13 +5,7 @@ import warnings
 import pytest
 import torch
 
-from tests.mpfa.transitions import (
-    make_buffer,
-    make_transitions,
-    seeded,
-    train_rounds,
-    write_signals,
-)
+from tests.mpfa.transitions import make_buffer, make_transitions, seeded, set_signals, train_rounds
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,
@@ -28,21 +22,17 @@ def pendulum(count=1200, *, seed=0):
     return make_transitions(count, rewards=-torch.rand(count, generator=seeded(seed)) * 16)
 
 
-def test_one_warning_names_the_cure():
-    buffer = make_buffer(2000, 32, entropy_refresh=0)
-    buffer.extend(pendulum())
-    cure = r"none of the 1200 rewards .*to 'mean', with which all weights are equal"
+@pytest.mark.parametrize(("sign", "share"), [(1.0, "none"), (-1.0, "all")])
+@pytest.mark.parametrize("options", [{}, {"fusion": ScaledFusion(EntropyFusion())}], ids=str)
+def test_one_warning_names_the_cure(sign, share, options):
+    buffer, rows = make_buffer(2000, 32, entropy_refresh=0, **options), pendulum()
+    rows["next", "reward"] *= sign
+    buffer.extend(rows)
+    cure = rf"{share} of the 1200 rewards .*to 'mean', with which all weights are equal"
     with pytest.warns(UserWarning, match=cure) as seen:
         train_rounds(buffer, 5)
     assert len(seen) == 1
-    assert buffer.sampler.weights == {"td_error": 0.0, "action_gradient": 0.0, "reward": 1.0}
-
-
-def test_rewards_that_are_all_positive_cause_a_warning_too():
-    buffer = make_buffer(2000, 32)
-    buffer.extend(make_transitions(1000, rewards=torch.rand(1000) + 0.1))
-    with pytest.warns(UserWarning, match="all of the 1000 rewards in the buffer are above 0.0"):
-        train_rounds(buffer, 1)
+    assert buffer.sampler.weights["td_error"] == buffer.sampler.weights["action_gradient"] == 0.0
 
 
 @pytest.mark.parametrize("reward", [0.0, -1.0])
@@ -104,10 +94,7 @@ def test_the_mean_of_the_buffer_reaches_the_boost():
     }
     buffer = make_buffer(4, positive_above="mean", eps=0.0, **parts)
     buffer.extend(make_transitions(4, rewards=[-1.0, -3.0, -5.0, -7.0]))
-    batch = buffer[torch.arange(4)]
-    batch["index"] = torch.arange(4)
-    write_signals(batch)["signals", "td_error"] = torch.ones(4)
-    buffer.update_tensordict_priority(batch)
+    set_signals(buffer, td_error=torch.ones(4), action_gradient=torch.ones(4))
     assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0]
 
 
@@ -138,8 +125,13 @@ def test_few_rewards_or_rewards_of_both_signs_are_no_reason_for_a_warning(reward
         train_rounds(buffer, 2)
 
 
-def test_a_fusion_around_the_entropies_is_looked_into():
-    buffer = make_buffer(2000, 32, fusion=ScaledFusion(EntropyFusion()), adjustments=[])
-    buffer.extend(pendulum())
-    with pytest.warns(UserWarning, match="none of the 1200 rewards"):
+def test_boost_alone_waits_for_rewards_above_a_level_and_not_for_positive_ones():
+    def train(level):
+        fusion = FixedFusion({"td_error": 1.0})
+        buffer = make_buffer(2000, 32, fusion=fusion, positive_above=level)
+        buffer.extend(pendulum())
         train_rounds(buffer, 1)
+
+    train(1.0)
+    with pytest.warns(UserWarning, match="none of the 1200 rewards in the buffer are above 0"):
+        train(0.0)

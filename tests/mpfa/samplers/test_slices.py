@@ -159,22 +159,6 @@ def test_no_slice_crosses_the_end_of_a_trajectory_or_the_newest_step(slice_prior
     assert lengths == ({LENGTH} if strict_length else {1, 2, 3, 4})
 
 
-@READINGS
-def test_starts_are_sampled_in_proportion_to_their_probability(slice_priority, strict_length):
-    buffer = filled(slice_priority=slice_priority, strict_length=strict_length)
-    expected = slices_by_hand(buffer)
-    leaf = torch.tensor([value**ALPHA for value in expected.values()], dtype=torch.double)
-    buffer.sampler._sampled(buffer.storage, 8)
-    starts = buffer.sampler._sample_slots(len(buffer), 50_000)[0]
-    count = torch.bincount(starts, minlength=CAPACITY).double()
-    assert set(starts.tolist()) <= set(expected)
-    wanted = 50_000 * leaf / leaf.sum()
-    square = ((count[list(expected)] - wanted) ** 2 / wanted).sum()
-    freedom = len(expected) - 1
-    # Five standard deviations above the mean of the chi-square distribution.
-    assert square < freedom + 5 * (2 * freedom) ** 0.5
-
-
 def test_weights_are_those_of_the_starts_and_of_every_step_of_a_slice():
     buffer = filled()
     priority = slices_by_hand(buffer)
@@ -204,15 +188,6 @@ def test_priorities_of_steps_equal_those_without_slices():
     torch.testing.assert_close(updated, single.sampler.priorities(slots))
     assert updated.unique().numel() > 10
     check_leaves(sliced)
-
-
-def test_steps_that_were_overwritten_are_left_out_of_an_update():
-    buffer = filled(batch_size=32)
-    batch = write_signals(buffer.sample())
-    buffer.extend(make_steps(32, 4))
-    buffer.update_tensordict_priority(batch)
-    assert 0 < buffer.stale_updates < 32
-    check_leaves(buffer)
 
 
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])

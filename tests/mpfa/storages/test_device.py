@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.samplers.test_trees import MADE
 from tests.mpfa.second_device import DEVICE
-from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same, seeded
+from tests.mpfa.transitions import make_buffer, make_rows, make_transitions, rejected, same, seeded
 from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.samplers import TreeSampler
@@ -40,28 +39,6 @@ def give_signals(buffer, slots, *, seed=0):
     buffer.sampler.update_signals(slots.to(device), signals, storage=buffer.storage)
 
 
-def full_rows(count, *, seed):
-    """Transitions with what any method asks for."""
-    generator, end = seeded(seed), torch.zeros(count, 1, dtype=torch.bool)
-    end[4::5] = True
-    return TensorDict(
-        {
-            "observation": torch.rand(count, 24, generator=generator),
-            "action": torch.rand(count, 2, generator=generator),
-            "episode": torch.arange(count) // 5,
-            "behavior_mean": torch.zeros(count, 2),
-            "behavior_sigma": torch.ones(count, 1),
-            "next": {
-                "observation": torch.rand(count, 24, generator=generator),
-                "reward": torch.randn(count, 1, generator=generator),
-                "done": end,
-                "terminated": torch.zeros(count, 1, dtype=torch.bool),
-            },
-        },
-        [count],
-    )
-
-
 @pytest.mark.parametrize("name", METHODS_THERE)
 def test_each_method_samples_and_learns_there(name):
     assert name in METHODS
@@ -74,7 +51,7 @@ def test_each_method_samples_and_learns_there(name):
         sigma=0.1,
     )
     for seed in range(3):
-        replay.buffer.extend(full_rows(20, seed=seed))
+        replay.buffer.extend(make_rows(20, seed=seed, observed=24, length=5))
         for sampled in replay.select(replay.buffer):
             batch = sampled.batch
             assert {value.device for value in batch.values(True, True)} == {DEVICE}
@@ -166,22 +143,6 @@ def test_a_sampler_follows_a_storage_to_the_device_of_its_first_transitions():
     assert buffer.sample()["index"].device == DEVICE
 
 
-def test_torchrls_buffer_with_a_tree_sampler_samples_there_by_priority():
-    sampler = TreeSampler(20, 1.0, 0.4, 0.0)
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(20, device=DEVICE), sampler=sampler, batch_size=500
-    )
-    buffer.extend(torch.arange(20))
-    priority = torch.zeros(20) + 1e-9
-    priority[[3, 7]] = torch.tensor([1.0, 3.0])
-    buffer.update_priority(torch.arange(20), priority)
-    sampled = buffer.sample()
-    assert sampled.device == DEVICE
-    shares = torch.bincount(sampled.cpu(), minlength=20) / 500
-    assert shares[[3, 7]].sum() == 1.0
-    assert 0.65 < shares[7] < 0.85
-
-
 def test_a_device_other_than_that_of_the_storage_is_rejected():
     sampler = MPFASampler(CAPACITY, device="cpu")
     with pytest.raises(ValueError, match="device must be that of the storage, cuda:0, or None"):
@@ -203,15 +164,6 @@ def test_a_state_of_one_device_loads_on_the_other(kind, first):
         give_signals(buffer, torch.arange(6), seed=5)
     assert same(loaded.sampler.priorities().cpu(), saved.sampler.priorities().cpu())
     assert same(loaded.storage.signal_table.rows.cpu(), saved.storage.signal_table.rows.cpu())
-
-
-def test_a_new_storage_there_takes_a_state_of_the_cpu():
-    saved = make_there(device=CPU)
-    storage = SignalTensorStorage(CAPACITY, device=DEVICE)
-    loaded = make_buffer(CAPACITY, BATCH, storage=storage)
-    loaded.load_state_dict(saved.state_dict())
-    assert loaded.sample()["observation"].device == DEVICE
-    assert loaded.storage.signal_table.rows.device == DEVICE
 
 
 def test_the_same_seed_samples_the_same_batches_there():

@@ -1,9 +1,12 @@
-"""Memory-mapped signals: no storage ever empties the file of another."""
+"""Memory-mapped signals: no storage ever empties the file of another, in no process."""
 
 import copy
 import gc
 import os
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -63,3 +66,28 @@ def test_copy_has_its_own_files_and_samples_like_the_first(tmp_path, folder, fil
     assert same(first[:].to_dict(), second[:].to_dict())
     assert (third[:]["observation"] >= 500).sum() == 12
     assert second.storage._storage.is_memmap()
+
+
+CODE = """
+import sys
+import torchrl_mpfa, torchrl_mpfa.integrations.trainer
+print('hydra' in sys.modules)
+torchrl_mpfa.SignalMemmapStorage(3, scratch_dir=sys.argv[1], existsok=True)
+"""
+
+
+def test_import_has_no_hydra_and_folder_in_use_is_rejected(tmp_path):
+    buffer = make_filled(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
+    before = buffer.storage.signal_table.rows.clone()
+    ended = subprocess.run(
+        [sys.executable, "-c", CODE, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[3],
+    )
+    assert ended.stdout.split()[-1] == "False"
+    assert ended.returncode == 1
+    assert "signals.memmap is in use by a living storage" in ended.stderr
+    assert torch.equal(before.nan_to_num(-1), buffer.storage.signal_table.rows.nan_to_num(-1))
+    train_rounds(buffer, 2)
