@@ -315,7 +315,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         with self._replay_lock:
             numbers: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
-                numbers.update(self._sampler.stats())
+                numbers |= {"compiled": self._sampler.compiled, **self._sampler.stats()}
         return numbers
 
     def state_dict(self) -> dict[str, Any]:

@@ -8,16 +8,13 @@ PyTorch does the same.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
 from ctypes import Structure, c_double, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from torchrl_mpfa.native.build import SOURCE, compile_library
-
-_BUILT = SOURCE.with_name("replay.so")
+from torchrl_mpfa.native.build import SOURCE, compile_library, library_name
 
 
 class Replay(Structure):
@@ -63,21 +60,37 @@ def library() -> Any:
     """Return the compiled loops; None where there are none."""
     if os.environ.get("TORCHRL_MPFA_NATIVE") == "0":
         return None
-    path = _BUILT if _BUILT.exists() else _cached()
-    if not path.exists() and not compile_library(path):
-        return None
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_mpfa"
+    for path in (SOURCE.with_name(library_name()), folder / library_name()):
+        if path.exists() and (compiled := _load(path)) is not None:
+            return compiled
     try:
-        loops = ctypes.CDLL(str(path))
-    except OSError:
+        return _load(path) if compile_library(path) else None
+    except OSError:  # A folder of caches that cannot be written.
         return None
-    for name, (result, arguments) in _FUNCTIONS.items():
-        function = getattr(loops, name)
-        function.restype, function.argtypes = result, arguments
-    return loops
 
 
-def _cached() -> Path:
-    """Return the file for this source in the user's folder of caches."""
-    folder = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    digest = hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]
-    return Path(folder) / "torchrl_mpfa" / f"replay-{digest}.so"
+def loops() -> Any:
+    """Return the compiled loops, which something that was made with them needs.
+
+    Raises:
+        RuntimeError: If there are none.
+    """
+    if (compiled := library()) is None:
+        raise RuntimeError(
+            "a sampler that was made with compiled loops needs them, and here are none: load its "
+            "state_dict() into a new one"
+        )
+    return compiled
+
+
+def _load(path: Path) -> Any:
+    """Return the loops of a file; None if the file is damaged or of another machine."""
+    try:
+        compiled = ctypes.CDLL(str(path))
+        for name, (result, arguments) in _FUNCTIONS.items():
+            function = getattr(compiled, name)
+            function.restype, function.argtypes = result, arguments
+    except (OSError, AttributeError):
+        return None
+    return compiled

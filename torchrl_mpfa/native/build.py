@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -11,6 +12,12 @@ from pathlib import Path
 SOURCE = Path(__file__).with_name("replay.c")
 # Sums of products as they are written: a fused product would be rounded otherwise.
 _OPTIONS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
+
+
+def library_name() -> str:
+    """Return the name of the library's file, which follows from the source."""
+    digest = hashlib.sha256(SOURCE.read_bytes() + " ".join(_OPTIONS).encode()).hexdigest()
+    return f"replay-{digest[:16]}.so"
 
 
 def compile_library(target: Path) -> bool:

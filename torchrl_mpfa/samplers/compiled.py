@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay, above_mean, factors_by_place
-from torchrl_mpfa.native import Fusion, Replay, library
+from torchrl_mpfa.native import Fusion, Replay, loops
 from torchrl_mpfa.samplers.trees import CompiledTree
 from torchrl_mpfa.samplers.weighing import Weighing, weigh
 from torchrl_mpfa.signals import REWARD
@@ -75,7 +75,7 @@ def sample_compiled(
     slots = shares.new_empty(shares.shape, dtype=torch.long)
     weight, written = shares.new_empty(shares.shape, dtype=torch.float), torch.empty_like(shares)
     replay = _replay(sampler)
-    wrong = library().sample(
+    wrong = loops().sample(
         addressof(replay),
         size,
         shares.data_ptr(),
@@ -119,7 +119,7 @@ def update_compiled(
     slots, replay = slots.contiguous(), _replay(sampler)
     batch = slots.data_ptr(), count
     written = None if written_at is None else written_at.data_ptr()
-    if library().stale(addressof(replay), filled, *batch, written):
+    if loops().stale(addressof(replay), filled, *batch, written):
         return None
     first = slots if batches == 1 else slots[: count // batches]
     weighing = weigh(sampler, first, sampler._weighing)  # Eqs. (15)-(20).
@@ -145,7 +145,7 @@ def update_compiled(
         None if decay is None else decay.data_ptr(),
     )
     addresses = array("q", [value.data_ptr() for value in values])
-    if library().update(
+    if loops().update(
         addressof(replay), addressof(fusion), *batch, batches, addresses.buffer_info()[0]
     ):
         return None
@@ -178,7 +178,7 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
     priority, replay = float(sampler._fresh_priority()), _replay(sampler)
     array_of_columns = array("q", columns)
     address = array_of_columns.buffer_info()[0]
-    if library().write_new(
+    if loops().write_new(
         addressof(replay),
         address,
         len(columns) // WIDTH,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Storage
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
-from torchrl_mpfa.native import library
+from torchrl_mpfa.native import library, loops
 from torchrl_mpfa.storages.schema import as_integers
 
 _ORDERED = 2048
@@ -51,11 +51,11 @@ class CompiledTree:
     def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
         slots, leaf = slots.contiguous(), leaf.contiguous()
         batch = slots.data_ptr(), leaf.data_ptr(), slots.numel()
-        library().set_leaves(*self._place, self.MINIMUM, *batch)
+        loops().set_leaves(*self._place, self.MINIMUM, *batch)
 
     def query(self, start: int, end: int) -> float:
         """Return the sum or minimum of the leaves from ``start`` to before ``end``."""
-        result: float = library().query(*self._place, self.MINIMUM, self.size, start, end)
+        result: float = loops().query(*self._place, self.MINIMUM, self.size, start, end)
         return result
 
 
@@ -75,7 +75,7 @@ class SumTree(CompiledTree):
         """Return the slots at shares of the sum of the first slots, shape ``[B]``."""
         slots = torch.empty(shares.shape, dtype=torch.long)
         batch = shares.data_ptr(), shares.numel(), slots.data_ptr()
-        library().find(*self._place, self.size, size, *batch)
+        loops().find(*self._place, self.size, size, *batch)
         return slots
 
 
