@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import sysconfig
 from pathlib import Path
@@ -16,8 +17,8 @@ class CompiledLoops(BuildHookInterface[Any]):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile the library, but for an editable install, which does so at the first use."""
-        if version == "editable":
+        """Compile the library, but for an editable install or a wheel for any processor."""
+        if version == "editable" or os.environ.get("TORCHRL_MPFA_NATIVE") == "0":
             return
         folder = Path(self.root) / "torchrl_mpfa" / "native"
         build = runpy.run_path(str(folder / "build.py"))
