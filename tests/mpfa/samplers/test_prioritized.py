@@ -46,7 +46,7 @@ def test_priorities_are_those_of_torchrl_after_the_same_updates(capacity):
     for tree in ("_sum_tree", "_min_tree"):
         found, expected = (torch.as_tensor(getattr(s, tree)[slots]) for s in (ours, theirs))
         # TorchRL's trees are in single precision, and of one slot it gives a number.
-        torch.testing.assert_close(found.float(), expected.reshape(-1))
+        torch.testing.assert_close(found.float().reshape(-1), expected.reshape(-1))
 
 
 def test_weights_are_those_of_torchrl_for_the_same_slots():
