@@ -276,7 +276,7 @@ class PositiveDecay(Adjustment):
         """Return the factor of Eq. (23) for each transition, shape ``[B]``."""
         if self.position == "count":
             return decay_factor(batch.replay_count, sharpness=self.sharpness)
-        by_place = _factors_by_place(
+        by_place = factors_by_place(
             priority.shape[-1], self.sharpness, priority.dtype, priority.device
         )
         if self.position == "batch":
@@ -290,13 +290,20 @@ class PositiveDecay(Adjustment):
         # A number is faster on the CPU; a GPU would be waited for.
         threshold = mean.item() if mean.is_cpu and mean.ndim == 0 else mean.unsqueeze(-1)
         decayed = priority * self.factors(priority, batch)
-        # The mean of equal numbers may be rounded to below them.
-        above = priority > threshold * (1.0 + _ROUNDING * torch.finfo(priority.dtype).eps)
+        above = priority > threshold * above_mean(priority.dtype)
         return torch.where(batch.positive & above, decayed, priority)
 
 
+def above_mean(dtype: torch.dtype) -> float:
+    """Return the multiple of the mean of its batch that a priority has to exceed to decay.
+
+    The mean of equal numbers may be rounded to below them.
+    """
+    return 1.0 + _ROUNDING * torch.finfo(dtype).eps
+
+
 @lru_cache(maxsize=64)
-def _factors_by_place(
+def factors_by_place(
     count: int, sharpness: float, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
     """Return factors of places 1 to ``count``: the same for every batch of that size."""

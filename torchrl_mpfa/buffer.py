@@ -22,6 +22,7 @@ from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
+from torchrl_mpfa.storages.tensor import SignalTensorStorage
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
 _MISSING = (
@@ -164,7 +165,18 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         return isinstance(self.sampler, SignalSampler)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
-        data, info = super()._sample(batch_size)
+        more = self._transform or self._sample_unit or self._pin_memory
+        if more or self._writer.tracks_generations or not self._fuses:
+            data, info = super()._sample(batch_size)
+        else:
+            with self._replay_lock, self._write_lock:
+                index, info = self._sampler.sample(self._storage, batch_size)
+                info["index"] = index
+                if isinstance(self._storage, SignalTensorStorage):
+                    data = self._storage.batch(index, info)
+                    if data is not None:
+                        return self._collate_fn(data), info
+                data = self._collate_fn(self._storage.get(index))
         # Written here, where the batch is made: afterwards TorchRL's buffer would move each
         # entry to the device that it is on already, at a tenth of the cost of the whole call.
         if self._fuses:
@@ -243,8 +255,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
-        if self._storage.ndim == 1:
-            index = as_integers(index).reshape(-1)
+        if self._storage.ndim == 1 and (index := as_integers(index)).ndim != 1:
+            index = index.reshape(-1)
         signals: dict[str, Tensor] = {}
         for signal in self._sampler.signals:
             if signal.known_at == "update":
@@ -303,7 +315,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         with self._replay_lock:
             numbers: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
-                numbers.update(self._sampler.stats())
+                numbers |= {"compiled": self._sampler.compiled, **self._sampler.stats()}
         return numbers
 
     def state_dict(self) -> dict[str, Any]:

@@ -9,10 +9,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer
+from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer, TensorDictRoundRobinWriter
 from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 
 from torchrl_mpfa.checks import check_not_negative
+from torchrl_mpfa.samplers.compiled import write_compiled
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalTensorStorage, slots_of
@@ -75,6 +76,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 f"got {[*tensordicts.shape]}: write a single step by add(...)"
             )
         tensordicts = self._without_padding(tensordicts)
+        if (index := self._extend_compiled(tensordicts)) is not None:
+            return index
         # Outside of inference mode: a caller without it must be able to use what is stored.
         with (
             torch.inference_mode(False),
@@ -82,6 +85,40 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             self._memory.transformed(tensordicts) as data,
         ):
             return self._extend_checked(data, update_priority is not False)
+
+    def _extend_compiled(self, data: TensorDictBase) -> Tensor | None:
+        """Write transitions by compiled loops; None where PyTorch has to, or finds fault."""
+        storage, sampler, writer = self._storage, self._sampler, self._writer
+        if (
+            type(storage) is not SignalTensorStorage
+            or storage.ndim != 1
+            or not storage.initialized
+            or type(data) is not TensorDict
+            or data.ndim != 1
+            or self.dim_extend
+            or not isinstance(sampler, SignalSampler)
+            or type(writer) is not TensorDictRoundRobinWriter
+            or writer.tracks_generations
+            or self._allow_nonfinite
+            or len(self._transform)
+            or data.get(self.priority_key, None) is not None
+            or any(other is not self for other in storage._attached_entities_iter())
+        ):
+            return None
+        with self._replay_lock, self._write_lock:
+            sampler.attach(storage)
+            start, count = writer._cursor, len(data)
+            if not write_compiled(sampler, storage._storage, data, start):
+                return None
+            end = start + count
+            index = torch.arange(start, end)
+            index = index if end <= storage.max_size else index % storage.max_size
+            writer._cursor = end % storage.max_size
+            writer._write_count += count
+            storage.note_written(index)
+            sampler.table.size = len(storage)
+            self._clock[0] += 1
+        return index
 
     def _without_padding(self, data: TensorDictBase) -> TensorDictBase:
         """Leave out rows that a mask of padded trajectories marks, as ``split_trajs`` makes it."""

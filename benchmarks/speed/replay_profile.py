@@ -3,8 +3,8 @@
     python -m benchmarks.speed.replay_profile       256 and 16 x 256 of 100,000 transitions
     python -m benchmarks.speed.replay_profile --capacity 1000000
 
-MPFA-PER, CPU time of one thread; each part is the median over the calls, and "rest" what a call
-takes beside its parts.
+MPFA-PER by compiled loops, CPU time of one thread; each part is the median over the calls, and
+"rest" what a call takes beside its parts.
 """
 
 from __future__ import annotations
@@ -21,30 +21,16 @@ from unittest.mock import patch
 
 from benchmarks.speed.replay import BATCH_SIZE, make_mpfa_buffer, make_mpfa_update
 from benchmarks.speed.timing import MICROSECONDS, few_threads
-from torchrl_mpfa import (
-    MPFASampler,
-    PositiveBoost,
-    PositiveDecay,
-    SignalReplayBuffer,
-    SignalTensorStorage,
-)
-from torchrl_mpfa.samplers import SignalTable
+from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa.samplers import fused
 
 Part = tuple[str, Any, str]
 SAMPLE: tuple[Part, ...] = (
-    ("slots and weights, Eqs. (8), (10)", MPFASampler, "_sample_slots"),
-    ("replay counts", SignalTable, "count_replay"),
-    ("times of writing", SignalTable, "written_at"),
-    ("entries of the batch", SignalTensorStorage, "get"),
+    ("slots, weights, counts and times, Eqs. (8), (10)", fused, "sample_compiled"),
+    ("entries of the batch", SignalTensorStorage, "batch"),
 )
 UPDATE: tuple[Part, ...] = (
-    ("rows that are not stale", SignalTable, "live_rows"),
-    ("new signals, Eqs. (13)-(14)", SignalTable, "fill_learned"),
-    ("checks of the signals", SignalTable, "check_fused"),
-    ("fusion, Eq. (21)", MPFASampler, "combined"),
-    ("boost, Eq. (22)", PositiveBoost, "__call__"),
-    ("decay, Eqs. (23)-(24)", PositiveDecay, "__call__"),
-    ("three trees and priorities, Eq. (8)", MPFASampler, "_set"),
+    ("signals, priorities and leaves, Eqs. (8), (13)-(24)", fused, "update_compiled"),
 )
 CALLS: tuple[tuple[Part, tuple[Part, ...]], ...] = (
     (("sample", SignalReplayBuffer, "sample"), SAMPLE),

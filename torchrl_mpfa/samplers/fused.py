@@ -19,17 +19,17 @@ from torchrl_mpfa.checks import (
     check,
     check_counts,
     check_index,
-    check_not_negative,
     check_shape,
     kind_of,
     unknown,
 )
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
+from torchrl_mpfa.samplers.compiled import is_compiled, sample_compiled, update_compiled
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
-from torchrl_mpfa.samplers.weighing import Weighing, weigh
+from torchrl_mpfa.samplers.weighing import Weighing, restored_weighing, weigh
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import REWARD, Signal, as_signals
 
@@ -88,6 +88,7 @@ class SignalSampler(TreeSampler):
     """
 
     KIND = "signals"
+    _compiled: bool | None = None
     KEPT: tuple[Signal, ...] = ()
     """Further entries of transitions that the table keeps."""
 
@@ -170,8 +171,16 @@ class SignalSampler(TreeSampler):
             device=self.device,
         )
 
+    @property
+    def compiled(self) -> bool:
+        """True if compiled loops write, sample and update; else PyTorch does."""
+        if self._compiled is None:
+            self._compiled = is_compiled(self, SignalSampler)
+        return self._compiled
+
     def _init(self) -> None:
         super()._init()
+        self._compiled = None
         self._weighing: Weighing | None = None
         self._last_batch: tuple[Tensor, Tensor] | None = None
 
@@ -253,11 +262,15 @@ class SignalSampler(TreeSampler):
 
         As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, marks overwritten slots.
         """
-        slots, weight = self._sampled(storage, batch_size)
-        info: dict[Any, Tensor] = {"priority_weight": weight}
+        if self.compiled:
+            size = self._filled(storage, batch_size)
+            slots, weight, written_at = sample_compiled(self, size, self._mass(batch_size))
+        else:
+            slots, weight = self._sampled(storage, batch_size)
+            self.table.count_replay(slots)
+            written_at = self.table.written_at(slots)
         self._last_batch = (slots, weight)
-        self.table.count_replay(slots)
-        info["written_at"] = self.table.written_at(slots)
+        info = {"priority_weight": weight, "written_at": written_at}
         return in_dimensions_of(storage, slots), info
 
     def update_priority(
@@ -311,9 +324,16 @@ class SignalSampler(TreeSampler):
             TypeError: If the index holds anything but integers.
         """
         table = self.attach(storage)
-        slots = as_slots(index, storage).to(table.device)
+        slots = as_slots(index, storage)
         if slots.numel() == 0:
             return 0
+        if self.compiled and (batches == 1 or self._takes_batches()):
+            updated = update_compiled(self, slots, signals, written_at, batches)
+            if updated is not None:
+                self._weighing, highest, slot = updated
+                self.keep_highest(highest, slot)
+                return 0
+        slots = slots.to(table.device)
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
         stale = 0 if live is None else len(live) - len(slots)
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
@@ -380,51 +400,17 @@ class SignalSampler(TreeSampler):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on; tensors and plain values only."""
         last = self._weighing or Weighing()
-        state = {
+        return {
             **super().state_dict(),
             "_signals": self.table.state_dict(),
-            "_weights": self.weights,
-            "_weighed_at": last.writes,
-            "_mean_reward": last.mean_reward,
+            **last.state_dict(self._names, counts=any(self._counting)),
         }
-        if any(self._counting):
-            state["_counted"] = [None if v is None else v.clone().cpu() for v in last.counted]
-            state["_counted_writes"] = last.counted_writes
-            state["_learned_since"] = last.learned_since
-        return state
 
     def _restore(self, state: dict[str, Any]) -> None:
-        names = sorted(self._names)
-        check_saved("sampler", state, ("_signals", "_weights", "_weighed_at", "_mean_reward"))
+        check_saved("sampler", state, ("_signals",))
         super()._restore(state)
         self.table = self.table.restored(state["_signals"], self._max_capacity, self.device)
-        counted = []
-        if any(self._counting):
-            check_saved("sampler", state, ("_counted", "_counted_writes", "_learned_since"))
-            counted = state["_counted"]
-            fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
-            if counted is None or (counted and fit != self._counting):
-                raise ValueError(
-                    f"'_counted' of the saved sampler must be empty, or finite numbers for "
-                    f"{sum(self._counting)} adjustments, got {counted}"
-                )
-        if not state["_weights"]:
-            return
-        if sorted(state["_weights"]) != names:
-            raise ValueError(
-                f"'_weights' of the saved sampler must be of the signals {names}, got "
-                f"{sorted(state['_weights'])}"
-            )
-        weights, mean = self._ordered(state["_weights"]), torch.tensor(state["_mean_reward"])
-        check_not_negative("'_weights' of the saved sampler", weights)
-        check_not_negative("mean reward of the saved sampler", mean.abs())
-        self._weighing = Weighing(
-            weights,
-            state["_mean_reward"],
-            state["_weighed_at"],
-            tuple(v if v is None else v.to(self.device) for v in counted),
-            *(state.get(name, 0) for name in ("_counted_writes", "_learned_since")),
-        )
+        self._weighing = restored_weighing(state, self._names, self._counting, self.device)
 
     def _take(self, twin: Any) -> None:
         table = self.table
@@ -432,7 +418,3 @@ class SignalSampler(TreeSampler):
         # The storage holds this one.
         table.take(self.table)
         self.table = table
-
-    def _ordered(self, weights: Mapping[str, float]) -> Tensor:
-        ordered = torch.tensor([weights[name] for name in self._names], dtype=torch.double)
-        return ordered.to(self.device)

@@ -24,12 +24,11 @@ from torchrl_mpfa.samplers.states import SavedTrees
 from torchrl_mpfa.samplers.trees import (
     Leaves,
     MinLeaves,
-    SumLeaves,
     as_slots,
-    empty_tree_like,
     in_dimensions_of,
     last_of_each,
     leaves_of,
+    make_trees,
     random_shares,
     set_leaves,
     slots_at,
@@ -112,24 +111,11 @@ class TreeSampler(SavedTrees):
         super().__init__(capacity, float(alpha), float(beta), float(eps), *rest)
 
     def _init(self) -> None:
-        if self.device.type == "cpu":
-            # TorchRL chooses its trees by the dtype, of which only the single one works there.
-            self.dtype = torch.double
-            try:
-                super()._init()
-            finally:
-                self.dtype = self._weight_dtype
-        else:
-            self._sum_tree = SumLeaves(self._max_capacity, self.device)
-            self._min_tree = MinLeaves(self._max_capacity, self.device)
         # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
         # over the negated priorities has it at its root. It leaves out fresh transitions: they
         # would hand on the highest priority that they were given, and one outlier would stay.
-        self._max_tree = empty_tree_like(self._min_tree, self._max_capacity, self.device)
-        # Priorities with eps, before alpha; NaN where nothing was written.
-        self._priorities = torch.full(
-            (self._max_capacity,), torch.nan, dtype=torch.double, device=self.device
-        )
+        trees, self._priorities = make_trees(self._max_capacity, self.device)
+        self._sum_tree, self._min_tree, self._max_tree = trees
         self._highest: float | None = None
         self._highest_slot: int | None = None
         # True on a GPU while all priorities are surely positive, so that sampling need not wait.
@@ -261,33 +247,42 @@ class TreeSampler(SavedTrees):
 
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample slots of the flattened storage and their weights, both of shape ``[B]``."""
+        slots, weight = self._sample_slots(self._filled(storage, batch_size), batch_size)
+        return slots, weight.to(self.dtype)
+
+    def _filled(self, storage: Storage, batch_size: int) -> int:
+        """Return the number of slots that a batch can be sampled from."""
         self._maybe_init_from_storage(storage)
         if self._rng is None:
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
             # does not reach.
             self._rng = seeded_generator()
-        check_counts(batch_size=batch_size)
+        if type(batch_size) is not int or batch_size < 1:
+            check_counts(batch_size=batch_size)
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")
-        slots, weight = self._sample_slots(size, batch_size)
-        return slots, weight.to(self.dtype)
+        return size
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample out of the first ``size`` slots: slots and weights, both of shape ``[B]``."""
-        lowest = self._min_tree.query(0, size)
         if not self._positive:
-            total = self._sum_tree.query(0, size)
-            if not bool((total > 0) & (lowest > 0)):
-                raise RuntimeError(
-                    f"every priority must be positive to sample, got a sum of {total} and a lowest "
-                    f"of {lowest}: raise eps, or give the buffer its sampler before its data"
-                )
+            self.check_positive(size)
             # A GPU is waited for once, and again after a priority that may be too low.
             self._positive = isinstance(self._sum_tree, Leaves)
+        lowest = self._min_tree.query(0, size)
         index = self._proportional(self._sum_tree, size, batch_size)
         leaf = leaves_of(self._sum_tree, index)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
+
+    def check_positive(self, size: int) -> None:
+        """Reject slots of which none can be sampled, or one has no priority."""
+        total, lowest = self._sum_tree.query(0, size), self._min_tree.query(0, size)
+        if not bool((total > 0) & (lowest > 0)):
+            raise RuntimeError(
+                f"every priority must be positive to sample, got a sum of {total} and a lowest "
+                f"of {lowest}: raise eps, or give the buffer its sampler before its data"
+            )
 
     def batch_weights(self, size: int) -> Tensor:
         """Return the weight of Eq. (10) that each of the first slots would have in a batch.
@@ -334,7 +329,7 @@ class TreeSampler(SavedTrees):
             return
         priority = self._fresh_priority()
         if self._highest is None:
-            self._highest, self._highest_slot = float(priority), int(slots[0])
+            self.keep_highest(float(priority), int(slots[0]))
         fresh = slots.new_empty(slots.shape, dtype=torch.double).fill_(priority)
         self._write(slots, fresh, learned=False)
 
@@ -426,7 +421,12 @@ class TreeSampler(SavedTrees):
         """Write priorities that an update gave, eps included, of which this is the highest."""
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
-            self._highest, self._highest_slot = highest, int(slots[priority.argmax()])
+            self.keep_highest(highest, int(slots[priority.argmax()]))
+
+    def keep_highest(self, highest: float, slot: int) -> None:
+        """Keep a priority and its slot if none was as high so far."""
+        if self._highest is None or highest > self._highest:
+            self._highest, self._highest_slot = highest, slot
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""

@@ -110,7 +110,9 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
         names, size = ("_learned", "_sum_tree", "_min_tree"), self._max_capacity
         check_saved("sampler", state, names, _max_capacity=size)
         self._init()
+        room = self._priorities
         super()._restore(state)
+        self._priorities = room.copy_(self._priorities)
         check(NOT_NEGATIVE, alpha=self._alpha, beta=self._beta, eps=self._eps)
         # NaN where nothing was written, and there trees are left as they are made.
         slots = (~self._priorities.isnan()).nonzero().squeeze(1)

@@ -9,11 +9,80 @@ import torch
 from tensordict import is_tensor_collection
 from torch import Tensor
 from torchrl.data import Storage
+from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
+from torchrl_mpfa.native import library, loops
 from torchrl_mpfa.storages.schema import as_integers
 
 _ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
+
+
+class CompiledTree:
+    """A segment tree whose loops are compiled, with the interface of TorchRL's but for tensors.
+
+    Sums and minima are the same as there to the last bit.
+
+    Args:
+        capacity: Number of slots ``N``.
+        nodes: Where the nodes are, with those of other trees beside them; by default alone.
+        column: Place among the other trees.
+    """
+
+    EMPTY: float
+    """Leaf of a slot that was never written."""
+    MINIMUM: bool
+
+    @torch.inference_mode(False)
+    def __init__(self, capacity: int, nodes: Tensor | None = None, column: int = 0) -> None:
+        self.size, self.width = capacity, 1 << capacity.bit_length()
+        self.nodes = torch.empty(2 * self.width, 1, dtype=torch.double) if nodes is None else nodes
+        self._column = column
+        self.nodes[:, column] = self.EMPTY
+
+    @property
+    def _place(self) -> tuple[int, int, int]:
+        """Address of the first node, numbers from node to node, and nodes of the last level."""
+        return self.nodes.data_ptr() + 8 * self._column, self.nodes.shape[1], self.width
+
+    def __getitem__(self, slots: Tensor) -> Tensor:
+        return self.nodes.select(1, self._column)[slots + self.width]
+
+    def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
+        slots, leaf = slots.contiguous(), leaf.contiguous()
+        batch = slots.data_ptr(), leaf.data_ptr(), slots.numel()
+        loops().set_leaves(*self._place, self.MINIMUM, *batch)
+
+    def query(self, start: int, end: int) -> float:
+        """Return the sum or minimum of the leaves from ``start`` to before ``end``."""
+        result: float = loops().query(*self._place, self.MINIMUM, self.size, start, end)
+        return result
+
+
+class SumTree(CompiledTree):
+    """A segment tree of sums.
+
+    Examples:
+        >>> tree = SumTree(3) if library() else SumLeaves(3)
+        >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
+        >>> float(tree.query(0, 3))
+        3.0
+    """
+
+    EMPTY, MINIMUM = 0.0, False
+
+    def slots_at(self, shares: Tensor, size: int) -> Tensor:
+        """Return the slots at shares of the sum of the first slots, shape ``[B]``."""
+        slots = torch.empty(shares.shape, dtype=torch.long)
+        batch = shares.data_ptr(), shares.numel(), slots.data_ptr()
+        loops().find(*self._place, self.size, size, *batch)
+        return slots
+
+
+class MinTree(CompiledTree):
+    """A segment tree of minima."""
+
+    EMPTY, MINIMUM = torch.finfo(torch.double).max, True
 
 
 class Leaves:
@@ -76,6 +145,22 @@ class MinLeaves(Leaves):
     def query(self, start: int, end: int) -> Tensor:
         """Return the lowest leaf from ``start`` to before ``end``, shape ``[]``."""
         return self._leaves[start:end].amin()
+
+
+def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor]:
+    """Return empty trees of sums, of minima and of minima, and priorities, NaN, shape ``[N]``."""
+    if device.type == "cpu" and library() is not None:
+        width = 1 << capacity.bit_length()
+        # Side by side: two children of a node are one line of the processor's cache.
+        nodes = torch.full((2 * width, 4), torch.nan, dtype=torch.double)
+        kinds = enumerate((SumTree, MinTree, MinTree))
+        return [kind(capacity, nodes, n) for n, kind in kinds], nodes[width : width + capacity, 3]
+    trees: list[Any]
+    if device.type == "cpu":
+        trees = [kind(capacity) for kind in (SumSegmentTreeFp64, *(MinSegmentTreeFp64,) * 2)]
+    else:
+        trees = [kind(capacity, device) for kind in (SumLeaves, MinLeaves, MinLeaves)]
+    return trees, torch.full((capacity,), torch.nan, dtype=torch.double, device=device)
 
 
 def empty_tree_like(tree: Any, capacity: int, device: torch.device) -> Any:
@@ -144,7 +229,7 @@ def last_of_each(slots: Tensor) -> Tensor | None:
 
 def leaves_of(tree: Any, slots: Tensor) -> Tensor:
     """Return the leaves of slots, shape ``[B]``."""
-    if isinstance(tree, Leaves):
+    if isinstance(tree, Leaves | CompiledTree):
         return tree[slots]
     # Given a tensor, the binding first tries it as a number, and spends ten times as long on the
     # error as on the leaves. Of an array it reads the memory from the start, without strides.
@@ -153,9 +238,9 @@ def leaves_of(tree: Any, slots: Tensor) -> Tensor:
 
 def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
     """Write leaves of slots, shape ``[B]``; the last leaf of a repeated slot counts."""
-    flat = isinstance(trees[0], Leaves)
-    places = slots if flat else slots.contiguous().numpy()
-    values = leaf if flat else leaf.contiguous().numpy()
+    takes_tensors = isinstance(trees[0], Leaves | CompiledTree)
+    places = slots if takes_tensors else slots.contiguous().numpy()
+    values = leaf if takes_tensors else leaf.contiguous().numpy()
     for tree in trees:
         tree[places] = values
 
@@ -187,6 +272,8 @@ def random_shares(count: int, *, stratified: bool, **random: Any) -> Tensor:
 
 def slots_at(shares: Tensor, tree: Any, size: int) -> Tensor:
     """Return the slots at shares of the sum of a tree, which become masses in place, ``[B]``."""
+    if isinstance(tree, SumTree):
+        return tree.slots_at(shares, size)
     slots: Tensor = tree.scan_lower_bound(shares.mul_(tree.query(0, size)))
     # Rounding can carry the last bit of mass past the last slot.
     return slots.clamp_max_(size - 1)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_not_negative
 from torchrl_mpfa.fusion import checked_weights
+from torchrl_mpfa.saving import check_saved
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.fused import SignalSampler
@@ -32,6 +34,60 @@ class Weighing:
     counted: tuple[Tensor | None, ...] = ()  # One result per adjustment, None if it has none.
     counted_writes: int = 0  # Transitions that had been written when the adjustments counted.
     learned_since: int = 0  # Transitions that were learned from since then.
+
+    def state_dict(self, names: Sequence[str], *, counts: bool) -> dict[str, Any]:
+        """Return what is saved of it, with what the adjustments counted if any counts."""
+        state: dict[str, Any] = {
+            "_weights": dict(zip(names, self.weights.tolist(), strict=False)),
+            "_weighed_at": self.writes,
+            "_mean_reward": self.mean_reward,
+        }
+        if counts:
+            state["_counted"] = [None if v is None else v.clone().cpu() for v in self.counted]
+            state["_counted_writes"] = self.counted_writes
+            state["_learned_since"] = self.learned_since
+        return state
+
+
+def restored_weighing(
+    state: dict[str, Any], names: Sequence[str], counting: Sequence[bool], device: torch.device
+) -> Weighing | None:
+    """Return what was saved; None where nothing had been weighed.
+
+    Raises:
+        KeyError: If an entry is missing.
+        ValueError: If the weights are of other signals, or a number is not finite.
+    """
+    check_saved("sampler", state, ("_weights", "_weighed_at", "_mean_reward"))
+    counted = []
+    if any(counting):
+        check_saved("sampler", state, ("_counted", "_counted_writes", "_learned_since"))
+        counted = state["_counted"]
+        fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
+        if counted is None or (counted and fit != counting):
+            raise ValueError(
+                f"'_counted' of the saved sampler must be empty, or finite numbers for "
+                f"{sum(counting)} adjustments, got {counted}"
+            )
+    if not state["_weights"]:
+        return None
+    if sorted(state["_weights"]) != sorted(names):
+        raise ValueError(
+            f"'_weights' of the saved sampler must be of the signals {sorted(names)}, got "
+            f"{sorted(state['_weights'])}"
+        )
+    weights = torch.tensor([state["_weights"][name] for name in names], dtype=torch.double)
+    check_not_negative("'_weights' of the saved sampler", weights)
+    check_not_negative(
+        "mean reward of the saved sampler", torch.tensor(state["_mean_reward"]).abs()
+    )
+    return Weighing(
+        weights.to(device),
+        state["_mean_reward"],
+        state["_weighed_at"],
+        tuple(v if v is None else v.to(device) for v in counted),
+        *(state.get(name, 0) for name in ("_counted_writes", "_learned_since")),
+    )
 
 
 def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weighing:

@@ -76,6 +76,8 @@ def as_index(index: Any) -> Any:
 
 def as_integers(index: Any) -> Tensor:
     """Return an index of any form but a tuple as a tensor of integers."""
+    if isinstance(index, Tensor) and index.dtype is torch.long:
+        return index
     index = as_index(index)
     try:
         integers = torch.as_tensor(index)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,8 +20,10 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
-from torchrl_mpfa.checks import bounds, check_counts, generator_on
+from torchrl_mpfa.checks import check_counts, generator_on
+from torchrl_mpfa.native import library
 from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
+from torchrl_mpfa.storages.rows import rows_at, write_rows
 from torchrl_mpfa.storages.schema import Schema, as_index
 
 if TYPE_CHECKING:
@@ -32,8 +34,6 @@ _MOVED = {
     "reward_key": "give it to the sampler",
     "allow_nonfinite": "give it to SignalReplayBuffer",
 }
-
-_Entries = dict[str, Union[Tensor, "_Entries"]]
 
 
 class SignalTensorStorage(LazyTensorStorage):
@@ -63,9 +63,6 @@ class SignalTensorStorage(LazyTensorStorage):
     _rng: torch.Generator | None
     signal_table: SignalTable | None = None
     """Table of the sampler that uses the storage; None before the first use."""
-    _looked_at: Any = None
-    _where: torch.device | None = None
-    _entries: _Entries
 
     def __init__(self, max_size: int, **kwargs: Any) -> None:
         max_size = check_counts(max_size=max_size)
@@ -78,25 +75,27 @@ class SignalTensorStorage(LazyTensorStorage):
         self.signal_table = table
 
     def _takes(self, slots: Any) -> bool:
-        """Return True if a batch of slots can be read and written entry by entry."""
+        """Return True if compiled loops may read and write a batch of slots."""
         return (
-            self.initialized
-            and self.ndim == 1
+            self.ndim == 1
             and isinstance(slots, Tensor)
-            and slots.is_cpu
-            and slots.ndim == 1
-            and 0 < len(slots) <= self.max_size
             and slots.dtype is torch.long
+            and slots.ndim == 1
+            and slots.is_cpu
+            and 0 < len(slots) <= self.max_size
+            and self.initialized
             and type(self._storage) is TensorDict
-            and slots.device == self._device_of_tensors()
+            and library() is not None
         )
+
+    def batch(self, slots: Any, more: Mapping[str, Tensor] | None = None) -> TensorDict | None:
+        """Read transitions, with further entries, by compiled loops; None where PyTorch has to."""
+        return rows_at(self._storage, slots, len(self), more) if self._takes(slots) else None
 
     def get(self, index: Any) -> Any:
         """Read transitions; all slots come as a tensordict that shares their tensors."""
-        if self._takes(index):
-            low, high = bounds(index)
-            if low >= 0 and high < len(self):
-                return _rows_of(self._storage, index)
+        if (batch := self.batch(index)) is not None:
+            return batch
         rows = super().get(as_index(index))
         # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
         return rows.copy() if rows is self._storage and is_tensor_collection(rows) else rows
@@ -108,14 +107,9 @@ class SignalTensorStorage(LazyTensorStorage):
             set_cursor
             and type(data) is TensorDict
             and self._takes(cursor)
-            and (pairs := _pairs(self._entries, data)) is not None
+            and write_rows(self._storage, cursor, data)
         ):
-            self._set_last_cursor(cursor)
-            with torch.no_grad():
-                for stored, value in pairs:
-                    stored.index_copy_(0, cursor, value)
-            self._len = min(len(self) + len(cursor), self.max_size)
-            self._bump_mutation_revision()
+            self.note_written(cursor)
             return
         size = len(self)
         try:
@@ -124,6 +118,12 @@ class SignalTensorStorage(LazyTensorStorage):
             # TorchRL counts the rows before it writes them.
             self._len = size
             raise
+
+    def note_written(self, slots: Tensor) -> None:
+        """Count transitions that were written in slots, the next ones, shape ``[B]``."""
+        self._set_last_cursor(slots)
+        self._len = min(len(self) + len(slots), self.max_size)
+        self._bump_mutation_revision()
 
     def __setitem__(self, index: Any, value: Any) -> None:
         """Write transitions in slots, and have the buffers that use the storage read them."""
@@ -200,24 +200,13 @@ class SignalTensorStorage(LazyTensorStorage):
                 Schema(stored, self.ndim, keys).check(data, self.ndim, whole=True)
 
     def _settle_loaded(self) -> None:
-        where = self._device_of_tensors() if self.initialized else None
+        where = _common_device(self._storage) if self.initialized else None
         if getattr(self, "device", None) == "auto":
             # TorchRL finds it out at the first write, which a restored storage has had.
             self.device = (where or torch.device("cpu")) if self.initialized else "auto"
         elif where not in (None, self.device):
             # What was saved on another device.
             self._storage = self._storage.to(self.device)
-
-    def _device_of_tensors(self) -> torch.device | None:
-        """Return the device of all entries; None if one is no tensor, which TorchRL reads."""
-        if self._looked_at is not self._storage:
-            self._looked_at, self._where = self._storage, _common_device(self._storage)
-            self._entries = _entries_of(self._storage) if self._where is not None else {}
-        return self._where
-
-    def __getstate__(self) -> Any:
-        # The copy looks at its own data.
-        return {**super().__getstate__(), "_looked_at": None, "_entries": {}}
 
 
 class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
@@ -321,53 +310,6 @@ def _common_device(data: Any) -> torch.device | None:
         return None
     devices = {_common_device(entry) for entry in data.values()}
     return devices.pop() if len(devices) == 1 else None
-
-
-def _rows_of(data: TensorDict, index: Tensor) -> TensorDict:
-    """Return rows of a tensordict that holds tensors only."""
-    rows = {
-        key: _rows_of(entry, index) if type(entry) is TensorDict else entry.index_select(0, index)
-        for key, entry in data.items()
-    }
-    # As TorchRL does inside: the constructor would check what fits, for two thirds of the time.
-    size = index.shape + data.batch_size[1:]
-    return TensorDict._new_unsafe(rows, batch_size=size, device=data.device)
-
-
-def _entries_of(data: Any) -> _Entries:
-    """Return the tensors of a tensordict by name, which take a tenth of its own access."""
-    if not isinstance(data, TensorDictBase):
-        return {}
-    return {
-        key: _entries_of(value) if isinstance(value, TensorDictBase) else value
-        for key, value in data.items()
-    }
-
-
-def _pairs(stored: _Entries, data: TensorDictBase) -> list[tuple[Tensor, Tensor]] | None:
-    """Return the tensors of a storage with their new values; None where TorchRL has to write."""
-    pairs: list[tuple[Tensor, Tensor]] = []
-    count = 0
-    for key, value in data.items():
-        entry = stored.get(key)
-        if isinstance(entry, Tensor):
-            if (
-                not isinstance(value, Tensor)
-                or entry.device != value.device
-                or entry.dtype is not value.dtype
-                or entry.shape[1:] != value.shape[1:]
-            ):
-                return None
-            pairs.append((entry, value))
-        elif entry is None or type(value) is not TensorDict:
-            return None
-        else:
-            below = _pairs(entry, value)
-            if below is None:
-                return None
-            pairs += below
-        count += 1
-    return pairs if count == len(stored) else None
 
 
 def _of_any_device(data: Any) -> Any:

@@ -1,0 +1,260 @@
+"""Compiled loops do what PyTorch does, are made where they are not there, and can be missing."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from tests.mpfa.native.paths import PATHS, take
+from tests.mpfa.transitions import make_buffer, make_transitions, seeded, write_signals
+from torchrl_mpfa import (
+    EntropyFusion,
+    FixedFusion,
+    PositiveBoost,
+    PositiveDecay,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    native,
+)
+from torchrl_mpfa.native.build import compile_library
+
+CAPACITY, BATCH = 37, 8
+
+
+@pytest.fixture(autouse=True)
+def own_library():
+    """The next test looks for the loops again."""
+    yield
+    native.library.cache_clear()
+
+
+def per_signal(name):
+    return {"signals": [name], "fusion": FixedFusion({name: 1.0}), "adjustments": ()}
+
+
+OPTIONS = {
+    "paper": {},
+    "td_error": per_signal("td_error"),
+    "reward": per_signal("reward"),
+    "boost": {"adjustments": [PositiveBoost(2.0, "cap")]},
+    "unbounded": {"adjustments": [PositiveBoost(2.0, "none")]},
+    "decay": {"adjustments": [PositiveDecay(0.5)]},
+    "share": {"adjustments": [PositiveBoost(target_share=0.5), PositiveDecay()]},
+    "level": {"positive_above": 0.4},
+    "stratified": {"stratified": True},
+    "ever": {"max_priority_within_buffer": False},
+    "uniform": {"alpha": 0.0},
+    "batch": {"fusion": EntropyFusion(population="batch")},
+    "refresh": {"entropy_refresh": 0.0},
+    "rank": {"adjustments": [PositiveBoost(), PositiveDecay(position="rank")]},
+}
+
+
+def stream(path, monkeypatch, options, *, updates=1, rounds=30):
+    """What is sampled, written and kept of a training on one path, and its buffer."""
+    take(path, monkeypatch)
+    buffer = make_buffer(CAPACITY, BATCH * updates, **copy.deepcopy(options))
+    generator, numbers, before = seeded(3), [], None
+    for turn in range(rounds):
+        data = make_transitions(1 + turn % 11, seed=turn, first=100 * turn)
+        slots = buffer.extend(data)
+        batch = write_signals(buffer.sample(), generator=generator)
+        if turn % 5 == 4:  # Some slots are written again before the update.
+            buffer.extend(make_transitions(9, seed=turn))
+        buffer.update_tensordict_priority(batch, batches=updates)
+        if before is not None and turn % 7 == 0:  # A batch that comes late.
+            buffer.update_tensordict_priority(before, batches=updates)
+        before = batch
+        entries = (slots, batch["index"], batch["observation"], batch["priority_weight"])
+        numbers.append(torch.cat([entry.double().flatten() for entry in entries]))
+    return numbers, buffer
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_both_paths_sample_the_same_slots_and_keep_the_same_numbers(name, updates, monkeypatch):
+    found, expected = (stream(path, monkeypatch, OPTIONS[name], updates=updates) for path in PATHS)
+    for one, other in zip(found[0], expected[0], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=0.0)  # Weights are single.
+    ours, theirs = (pair[1] for pair in (found, expected))
+    assert ours.stale_updates == theirs.stale_updates > 0
+    close = {"rtol": 1e-12, "atol": 0.0, "equal_nan": True}
+    torch.testing.assert_close(ours.sampler.table.rows, theirs.sampler.table.rows, **close)
+    torch.testing.assert_close(ours.sampler.priorities(), theirs.sampler.priorities(), **close)
+    states = [buffer.sampler.state_dict() for buffer in (ours, theirs)]
+    for leaves in ("_sum_tree", "_min_tree", "_learned"):
+        torch.testing.assert_close(states[0][leaves], states[1][leaves], **close)
+    assert states[0]["_highest"] == pytest.approx(states[1]["_highest"], rel=1e-12)
+    assert states[0]["_highest_slot"] == states[1]["_highest_slot"]
+
+
+def test_a_state_of_one_path_trains_on_the_other_as_there(monkeypatch):
+    _, first = stream("compiled", monkeypatch, {})
+    state = copy.deepcopy(first.state_dict())
+    expected = first.sample()["index"]
+    take("pytorch", monkeypatch)
+    second = make_buffer(CAPACITY, BATCH)
+    second.load_state_dict(state)
+    assert second.sample()["index"].equal(expected)
+
+
+def test_a_sampler_made_with_loops_says_that_it_needs_them(monkeypatch):
+    _, buffer = stream("compiled", monkeypatch, {})
+    take("pytorch", monkeypatch)
+    with pytest.raises(RuntimeError, match="needs them, and here are none: load its state_dict"):
+        buffer.sample()
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_statistics_say_which_path_a_buffer_takes(path, monkeypatch):
+    take(path, monkeypatch)
+    assert make_buffer().stats()["compiled"] == (path == "compiled")
+
+
+def test_adjustments_of_ones_own_take_pytorch(monkeypatch):
+    take("compiled", monkeypatch)
+
+    class Half(PositiveBoost):
+        def __call__(self, priority, batch):
+            return 0.5 * priority
+
+    buffer = make_buffer(adjustments=[Half()])
+    assert not buffer.sampler.compiled
+    buffer.extend(make_transitions(16))
+    buffer.update_tensordict_priority(write_signals(buffer.sample()))
+    assert make_buffer().sampler.compiled
+
+
+def test_rows_of_no_numbers_and_of_any_type_are_read_and_written(monkeypatch):
+    take("compiled", monkeypatch)
+    storage = SignalTensorStorage(6)
+    rows = make_transitions(4)
+    for name, value in {
+        "empty": torch.zeros(4, 0),
+        "half": torch.rand(4, 3).half(),
+        "whole": torch.arange(12, dtype=torch.int16).reshape(4, 3),
+        "yes": torch.tensor([True, False, True, True]),
+        "image": torch.randint(0, 255, (4, 2, 5, 3), dtype=torch.uint8),
+        "complex": torch.rand(4, 2, dtype=torch.cfloat),
+    }.items():
+        rows[name] = value
+    storage.set(torch.arange(4), rows)
+    slots = torch.tensor([3, 0, 0, 2])
+    storage.set(torch.tensor([1, 5]), rows[:2])
+    assert (storage.get(torch.tensor([1, 5])) == rows[:2]).all()
+    assert (storage.get(slots) == rows[slots]).all()
+
+
+def test_values_that_do_not_lie_one_after_the_other_are_written_as_they_are(monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16)
+    buffer.extend(make_transitions(4))
+    rows = make_transitions(4, seed=1)
+    rows["observation"] = torch.arange(8.0).reshape(4, 2)[:, :1]
+    rows["next", "reward"] = torch.arange(4.0).flip(0).unsqueeze(1).requires_grad_()
+    slots = buffer.extend(rows)
+    assert buffer[:]["observation"][slots].flatten().tolist() == [0.0, 2.0, 4.0, 6.0]
+    assert buffer.sampler.table.rewards[slots].tolist() == [3.0, 2.0, 1.0, 0.0]
+    assert rows.get("index", None) is None
+
+
+@pytest.mark.parametrize("number", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("dtype", [torch.half, torch.float, torch.double])
+def test_a_number_that_is_not_finite_is_rejected_and_nothing_written(number, dtype, monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16)
+    rows = make_transitions(4).set("further", torch.zeros(4, 3, dtype=dtype))
+    buffer.extend(rows)
+    before = copy.deepcopy(buffer.state_dict())
+    wrong = rows.clone()
+    wrong["further"][2, 1] = number
+    with pytest.raises(ValueError, match="'further' must be finite"):
+        buffer.extend(wrong)
+    assert buffer.writer._cursor == len(buffer) == 4
+    assert torch.equal(before["_sampler"]["_sum_tree"], buffer.sampler.state_dict()["_sum_tree"])
+
+
+def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(monkeypatch):
+    found = []
+    for path in PATHS:
+        take(path, monkeypatch)
+        buffer = make_buffer(10)
+        for count in (3, 10, 25):
+            buffer.extend(make_transitions(count, seed=count, first=count))
+        found.append((buffer[:]["observation"], buffer.sampler.table.rows))
+    assert torch.equal(found[0][0], found[1][0])
+    torch.testing.assert_close(found[0][1], found[1][1], equal_nan=True, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda part: pickle.loads(pickle.dumps(part))])
+def test_copy_of_a_sampler_shares_no_tree_with_the_first(copied, monkeypatch):
+    take("compiled", monkeypatch)
+    _, buffer = stream("compiled", monkeypatch, {})
+    sampler = copied(buffer.sampler)
+    before = sampler.state_dict()["_sum_tree"].clone()
+    buffer.extend(make_transitions(20))
+    assert torch.equal(sampler.state_dict()["_sum_tree"], before)
+
+
+def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    native.library.cache_clear()
+    assert native.library() is None
+    buffer = make_buffer(16)
+    buffer.extend(make_transitions(16))
+    buffer.update_tensordict_priority(write_signals(buffer.sample()))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compiler_that_fails_leaves_no_file(monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", "false")
+    assert not compile_library(tmp_path / "folder" / "replay.so")
+    assert list((tmp_path / "folder").iterdir()) == []
+
+
+def test_a_damaged_library_is_compiled_again(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.library.cache_clear()
+    assert native.library() is not None
+    (made,) = (tmp_path / "torchrl_mpfa").iterdir()
+    # Not in place: this process has it mapped.
+    made.unlink()
+    made.write_bytes(b"not a library")
+    native.library.cache_clear()
+    assert native.library() is not None
+
+
+def test_a_first_use_in_two_processes_at_once_gives_both_the_loops(tmp_path):
+    program = "from torchrl_mpfa.native import library; assert library() is not None"
+    environment = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
+    command = [sys.executable, "-c", program]
+    runs = [subprocess.Popen(command, env=environment) for _ in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
+
+
+def test_several_threads_write_and_sample_one_buffer(monkeypatch):
+    from threading import Thread
+
+    take("compiled", monkeypatch)
+    buffer: SignalReplayBuffer = make_buffer(64, 16)
+    buffer.extend(make_transitions(64))
+
+    def work(seed):
+        for turn in range(40):
+            buffer.extend(make_transitions(5, seed=seed + turn))
+            buffer.update_tensordict_priority(write_signals(buffer.sample(), seed=turn))
+
+    threads = [Thread(target=work, args=(100 * n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    sampler = buffer.sampler
+    leaves = sampler.state_dict()["_sum_tree"]
+    assert float(sampler._sum_tree.query(0, 64)) == pytest.approx(float(leaves.sum()), rel=1e-12)
+    assert sampler.table.writes == 64 + 3 * 40 * 5

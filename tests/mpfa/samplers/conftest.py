@@ -1,0 +1,14 @@
+"""Every test of the samplers runs with compiled loops, and with PyTorch in their place."""
+
+import pytest
+
+from tests.mpfa.native.paths import PATHS, take
+from torchrl_mpfa import native
+
+
+@pytest.fixture(autouse=True, params=PATHS)
+def path(request, monkeypatch):
+    """What samplers and storages of a test take."""
+    take(request.param, monkeypatch)
+    yield request.param
+    native.library.cache_clear()

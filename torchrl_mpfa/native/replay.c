@@ -1,0 +1,271 @@
+// Loops of prioritized replay. A caller has checked types, devices and lengths.
+//
+// A tree over N slots is an array of 2 * width nodes: width is the smallest power of two above N, node
+// k has the children 2k and 2k + 1, and slot s is node width + s. Its numbers are `stride` apart, as
+// several trees may share an array. Sums and minima are made in the order of TorchRL's trees, so that
+// they are the same to the last bit.
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct {
+  char *stored;
+  char *rows;
+  int64_t bytes;   // Of one row.
+  int64_t number;  // 4 or 8: single or double precision; else 0.
+} Column;
+
+enum {
+  AHEAD = 8,  // Rows whose memory is asked for before they are needed.
+  SIDE = 16   // Descents side by side, each of which waits for memory at every level.
+};
+
+static inline double least(double a, double b) { return a < b ? a : b; }
+
+// Trees.
+
+void set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, const int64_t *slots,
+                const double *leaf, int64_t n) {
+  for (int64_t i = 0; i < n; i++) t[(width | slots[i]) * stride] = leaf[i];
+  // Level by level, so that no slot waits for another; of a narrow level all nodes.
+  for (int shift = 1; width >> shift; shift++) {
+    int64_t nodes = width >> shift, all = nodes < n;
+    for (int64_t i = 0; i < (all ? nodes : n); i++) {
+      int64_t k = all ? nodes + i : (width | slots[i]) >> shift;
+      double a = t[2 * k * stride], b = t[(2 * k + 1) * stride];
+      t[k * stride] = minimum ? least(a, b) : a + b;
+    }
+  }
+}
+
+double query(const double *t, int64_t stride, int64_t width, int64_t minimum, int64_t size,
+             int64_t start, int64_t end) {
+  if (start <= 0 && end >= size) return t[stride];
+  double result = minimum ? 1.7976931348623157e308 : 0.0;
+  for (int64_t l = start | width, r = end | width; l < r; l >>= 1, r >>= 1) {
+    if (l & 1) { double v = t[l++ * stride]; result = minimum ? least(result, v) : result + v; }
+    if (r & 1) { double v = t[--r * stride]; result = minimum ? least(result, v) : result + v; }
+  }
+  return result;
+}
+
+// Slots at shares of the sum of the filled slots.
+void find(const double *t, int64_t stride, int64_t width, int64_t size, int64_t filled,
+          const double *share, int64_t n, int64_t *slots) {
+  double total = query(t, stride, width, 0, size, 0, filled);
+  for (int64_t i = 0; i < n; i += SIDE) {
+    int m = n - i < SIDE ? (int)(n - i) : SIDE;
+    int64_t k[SIDE];
+    double v[SIDE];
+    for (int j = 0; j < m; j++) { k[j] = 1; v[j] = share[i + j] * total; }
+    for (int64_t d = 1; d < width; d <<= 1)
+      for (int j = 0; j < m; j++) {
+        int64_t q = k[j] << 1;
+        double left = t[q * stride];
+        int right = v[j] > left;
+        v[j] -= left * right;  // No branch, as it could not be predicted.
+        k[j] = q | right;
+      }
+    for (int j = 0; j < m; j++) {
+      // Rounding can carry the last bit of mass past the last slot.
+      int64_t s = k[j] ^ width;
+      slots[i + j] = s < filled ? s : filled - 1;
+    }
+  }
+}
+
+// Rows of transitions.
+
+static int64_t outside(const int64_t *slots, int64_t n, int64_t end) {
+  int64_t wrong = 0;
+  for (int64_t i = 0; i < n; i++) wrong |= slots[i] < 0 || slots[i] >= end;
+  return wrong;
+}
+
+// Both return 1, and do nothing, if a slot is not below `end`.
+int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
+  if (outside(slots, n, end)) return 1;
+  for (int64_t c = 0; c < count; c++) {
+    int64_t b = columns[c].bytes;
+    const char *from = columns[c].stored;
+    char *to = columns[c].rows;
+    // A copy whose size the compiler knows takes one instruction.
+    if (b == 1) for (int64_t i = 0; i < n; i++) to[i] = from[slots[i]];
+    else if (b == 4) for (int64_t i = 0; i < n; i++) memcpy(to + 4 * i, from + 4 * slots[i], 4);
+    else if (b == 8) for (int64_t i = 0; i < n; i++) memcpy(to + 8 * i, from + 8 * slots[i], 8);
+    else
+      for (int64_t i = 0; i < n; i++) {
+        __builtin_prefetch(from + slots[i + AHEAD < n ? i + AHEAD : i] * b);
+        memcpy(to + i * b, from + slots[i] * b, b);
+      }
+  }
+  return 0;
+}
+
+int64_t scatter(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
+  if (outside(slots, n, end)) return 1;
+  for (int64_t c = 0; c < count; c++) {
+    int64_t b = columns[c].bytes;
+    for (int64_t i = 0; i < n; i++) memcpy(columns[c].stored + slots[i] * b, columns[c].rows + i * b, b);
+  }
+  return 0;
+}
+
+// Signals and priorities.
+
+typedef struct {
+  double sum, lowest;       // Of the leaves.
+  double highest;           // Minus the highest priority that was learned.
+  double priority;          // Of a slot; of no use in other nodes.
+} Node;                     // Two children are one line of a cache.
+
+typedef struct {
+  Node *nodes;
+  double *table;                  // Rows of signals, [N, columns].
+  int64_t slots, width, columns;  // N; of the tree; of the table.
+} Replay;
+
+// The last three columns are the reward, the replay count and the time of writing.
+static inline double *row_of(const Replay *r, int64_t slot) { return r->table + slot * r->columns; }
+static inline void ask_for(const Replay *r, const int64_t *slots, int64_t i, int64_t n) {
+  __builtin_prefetch(row_of(r, slots[i + AHEAD < n ? i + AHEAD : i]));
+}
+
+static void lift(Node *t, int64_t width, const int64_t *slots, int64_t n) {
+  for (int shift = 1; width >> shift; shift++) {
+    int64_t nodes = width >> shift, all = nodes < n;
+    for (int64_t i = 0; i < (all ? nodes : n); i++) {
+      int64_t k = all ? nodes + i : (width | slots[i]) >> shift;
+      Node a = t[2 * k], b = t[2 * k + 1];
+      t[k].sum = a.sum + b.sum;
+      t[k].lowest = least(a.lowest, b.lowest);
+      t[k].highest = least(a.highest, b.highest);
+    }
+  }
+}
+
+// Sample by Eq. (8) out of the filled slots, with weights of Eq. (10) and times of writing, and count
+// a replay of each. Returns 1, and does nothing, if a priority is not positive.
+int64_t sample(const Replay *r, int64_t filled, const double *share, int64_t n, double beta,
+               int64_t *slots, float *weight, double *written) {
+  Node *t = r->nodes;
+  double low = query(&t->lowest, 4, r->width, 1, r->slots, 0, filled);
+  if (!(low > 0.0 && t[1].sum > 0.0)) return 1;
+  find(&t->sum, 4, r->width, r->slots, filled, share, n, slots);
+  for (int64_t i = 0; i < n; i++) {
+    ask_for(r, slots, i, n);
+    double *end = row_of(r, slots[i]) + r->columns;
+    end[-2] += 1.0;
+    written[i] = end[-1];
+    weight[i] = (float)pow(t[r->width | slots[i]].sum / low, -beta);
+  }
+  return 0;
+}
+
+typedef struct {
+  const double *weights;  // Of the signals that are fused, [fused]; learned ones are the first.
+  int64_t fused, learned;
+  double eps, alpha, level;
+  int64_t bound;        // Of Eq. (22): 0 no boost, 1 floor, 2 cap, 3 none.
+  double boost, margin; // How far above the mean of a batch a priority decays.
+  const double *decay;  // Factors of Eq. (23) by place in a batch, or NULL.
+  double highest;       // Results: the highest priority of the batches, and its slot.
+  int64_t slot;
+} Fusion;
+
+// Returns 1 if a slot is not filled or was written since.
+int64_t stale(const Replay *r, int64_t filled, const int64_t *slots, int64_t n, const double *written) {
+  if (outside(slots, n, filled)) return 1;
+  for (int64_t i = 0; written && i < n; i++) {
+    ask_for(r, slots, i, n);
+    if (row_of(r, slots[i])[r->columns - 1] != written[i]) return 1;
+  }
+  return 0;
+}
+
+// Set signals and priorities of live batches of one size by Eqs. (21)-(24), by way of copies of the
+// rows. Returns 1, and changes nothing, if a number is wrong.
+int64_t update(const Replay *r, Fusion *f, const int64_t *slots, int64_t n, int64_t batches,
+               const float *const *signals) {
+  int64_t columns = r->columns, size = n / batches, top = 0, wrong = 1;
+  double *rows = malloc(8 * n * (columns + 1)), *priority = rows + n * columns;
+  if (rows == NULL) return 1;
+  for (int64_t i = 0; i < n; i++) {
+    double *row = rows + i * columns, *end = row + columns, p = 0.0;
+    memcpy(row, row_of(r, slots[i]), 8 * columns);
+    for (int64_t k = 0; k < f->learned; k++) row[k] = (double)signals[k][i];
+    for (int64_t k = 0; k < f->fused; k++) {
+      if (!(row[k] >= 0.0 && row[k] < INFINITY)) goto end;
+      p += row[k] * f->weights[k];
+    }
+    p += f->eps;
+    if (f->bound && end[-3] > f->level) {
+      p *= f->boost;
+      if (f->bound == 1 && p < 1.0) p = 1.0;
+      if (f->bound == 2 && p > 1.0) p = 1.0;
+    }
+    priority[i] = p;
+  }
+  for (int64_t u = 0; f->decay && u < batches; u++) {
+    double *p = priority + u * size, mean = 0.0;
+    for (int64_t i = 0; i < size; i++) mean += p[i];
+    mean = mean / size * f->margin;
+    for (int64_t i = 0; i < size; i++)
+      if (p[i] > mean && rows[(u * size + i) * columns + columns - 3] > f->level) p[i] *= f->decay[i];
+  }
+  for (int64_t i = 1; i < n; i++)
+    if (priority[i] > priority[top]) top = i;
+  // A sum of so many leaves must not overflow.
+  if (!(pow(priority[top], f->alpha) * r->slots < 1e307)) goto end;
+  for (int64_t i = 0; i < n; i++) {
+    double leaf = pow(priority[i], f->alpha);
+    memcpy(row_of(r, slots[i]), rows + i * columns, 8 * columns);
+    r->nodes[r->width | slots[i]] = (Node){leaf, leaf, -priority[i], priority[i]};
+  }
+  lift(r->nodes, r->width, slots, n);
+  f->highest = priority[top];
+  f->slot = slots[top];
+  wrong = 0;
+end:
+  free(rows);
+  return wrong;
+}
+
+static int is_finite(const Column *c, int64_t n) {
+  // A sum of products with zero is zero only if all numbers are finite.
+  int64_t count = c->number ? n * c->bytes / c->number : 0;
+  double sum = 0.0;
+  if (c->number == 4) for (int64_t i = 0; i < count; i++) sum += 0.0 * ((const float *)c->rows)[i];
+  if (c->number == 8) for (int64_t i = 0; i < count; i++) sum += 0.0 * ((const double *)c->rows)[i];
+  return sum == 0.0;
+}
+
+// Write new transitions from a slot on, around the end, all with one priority. `reward` is the column
+// that has the reward, `index` the one of slots, `signal` the place of its absolute value in the table,
+// or -1. Returns 1, and writes nothing, if a number is not finite.
+int64_t write_new(const Replay *r, const Column *columns, int64_t count, int64_t start, int64_t n,
+                  const Column *reward, int64_t *index, int64_t signal, double time, double priority,
+                  double alpha) {
+  for (int64_t c = 0; c < count; c++)
+    if (!is_finite(columns + c, n)) return 1;
+  int64_t *slots = malloc(8 * n);
+  if (slots == NULL) return 1;
+  for (int64_t i = 0; i < n; i++) slots[i] = (start + i) % r->slots;
+  scatter(columns, count, slots, n, r->slots);
+  double leaf = pow(priority, alpha);
+  for (int64_t i = 0; i < n; i++) {
+    double *row = row_of(r, slots[i]), *end = row + r->columns;
+    double value = reward->number == 4 ? ((const float *)reward->rows)[i] : ((const double *)reward->rows)[i];
+    for (int64_t k = 0; k < r->columns - 3; k++) row[k] = NAN;
+    if (signal >= 0) row[signal] = fabs(value);
+    end[-3] = value;
+    end[-2] = 0.0;
+    end[-1] = time + i;
+    index[slots[i]] = slots[i];
+    r->nodes[r->width | slots[i]] = (Node){leaf, leaf, INFINITY, priority};
+  }
+  lift(r->nodes, r->width, slots, n);
+  free(slots);
+  return 0;
+}

@@ -1,0 +1,204 @@
+"""Sampling and updating a batch by one compiled call each, for samplers as the paper's.
+
+PyTorch does the same for everything else: other devices, adjustments and functions of signals, and
+subclasses that change a step between signals and leaves.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+from ctypes import addressof
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay, above_mean, factors_by_place
+from torchrl_mpfa.native import Fusion, Replay, loops
+from torchrl_mpfa.samplers.trees import CompiledTree
+from torchrl_mpfa.samplers.weighing import Weighing, weigh
+from torchrl_mpfa.signals import REWARD
+from torchrl_mpfa.storages.rows import WIDTH, match_rows
+from torchrl_mpfa.storages.schema import INDEX_KEY
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.samplers.fused import SignalSampler
+
+_BOUNDS = {"floor": 1, "cap": 2, "none": 3}
+_MARGIN = above_mean(torch.double)
+_KINDS: list[tuple[type, ...]] = [
+    (),
+    (PositiveBoost,),
+    (PositiveDecay,),
+    (PositiveBoost, PositiveDecay),
+]
+
+
+_STEPS = (
+    *("mark_update", "_record", "check_new", "_sampled", "_sample_slots", "_proportional"),
+    *("_fused", "combined", "_checked", "_set", "_write", "_write_leaves", "_leaf"),
+)
+"""Steps that compiled loops know as they are in ``SignalSampler``."""
+
+
+def is_compiled(sampler: SignalSampler, kind: type[SignalSampler]) -> bool:
+    """Return True if compiled loops write, sample and update for a sampler of this kind."""
+    return (
+        all(getattr(type(sampler), step) is getattr(kind, step) for step in _STEPS)
+        and sampler.dtype is torch.float
+        and isinstance(sampler._sum_tree, CompiledTree)
+        and tuple(map(type, sampler.adjustments)) in _KINDS
+        and all(signal.priority is None for signal in sampler.table.learned)
+        and all(getattr(a, "position", "batch") == "batch" for a in sampler.adjustments)
+    )
+
+
+def _replay(sampler: SignalSampler) -> Replay:
+    tree, rows = sampler._sum_tree, sampler.table.rows
+    sizes = tree.size, tree.width, rows.shape[1]
+    return Replay(tree.nodes.data_ptr(), rows.data_ptr(), *sizes)
+
+
+def sample_compiled(
+    sampler: SignalSampler, size: int, shares: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return slots, weights and times of writing at shares of the total priority, each ``[B]``.
+
+    A replay of each is counted.
+
+    Raises:
+        RuntimeError: If a priority is not positive.
+    """
+    slots = shares.new_empty(shares.shape, dtype=torch.long)
+    weight, written = shares.new_empty(shares.shape, dtype=torch.float), torch.empty_like(shares)
+    replay = _replay(sampler)
+    wrong = loops().sample(
+        addressof(replay),
+        size,
+        shares.data_ptr(),
+        shares.numel(),
+        sampler._beta,
+        slots.data_ptr(),
+        weight.data_ptr(),
+        written.data_ptr(),
+    )
+    if wrong:
+        sampler.check_positive(size)
+    return slots, weight, written
+
+
+def update_compiled(
+    sampler: SignalSampler,
+    slots: Tensor,
+    signals: Mapping[str, Tensor],
+    written_at: Tensor | None,
+    batches: int,
+) -> tuple[Weighing, float, int] | None:
+    """Set signals and priorities of batches; return weights, the highest priority and its slot.
+
+    None, and nothing changes, for what PyTorch has to do, or find fault with.
+    """
+    table, count = sampler.table, slots.numel()
+    if type(batches) is not int or batches < 1 or count % batches:
+        return None
+    values = []
+    for signal in table.learned:
+        value = signals.get(signal.name)
+        if value is None or value.dtype is not torch.float or value.numel() != count:
+            return None
+        values.append(value.contiguous())
+    if written_at is None:
+        filled = table.size
+    elif written_at.dtype is torch.double and written_at.numel() == count:
+        filled, written_at = max(table.size, table.cleared), written_at.contiguous()
+    else:
+        return None
+    slots, replay = slots.contiguous(), _replay(sampler)
+    batch = slots.data_ptr(), count
+    written = None if written_at is None else written_at.data_ptr()
+    if loops().stale(addressof(replay), filled, *batch, written):
+        return None
+    first = slots if batches == 1 else slots[: count // batches]
+    weighing = weigh(sampler, first, sampler._weighing)  # Eqs. (15)-(20).
+    level = weighing.mean_reward if sampler.positive_above == "mean" else sampler.positive_above
+    bound, boost, decay = 0, 1.0, None
+    for place, adjust in enumerate(sampler.adjustments):
+        if isinstance(adjust, PositiveBoost):
+            counted = weighing.counted[place] if weighing.counted else None
+            bound, boost = _BOUNDS[adjust.bound], float(adjust.factor(counted))
+        elif isinstance(adjust, PositiveDecay):
+            decay = _decay(count // batches, adjust.sharpness)
+    weights = weighing.weights
+    fusion = Fusion(
+        weights.data_ptr(),
+        weights.numel(),
+        len(values),
+        sampler._eps,
+        sampler._alpha,
+        level,
+        bound,
+        boost,
+        _MARGIN,
+        None if decay is None else decay.data_ptr(),
+    )
+    addresses = array("q", [value.data_ptr() for value in values])
+    if loops().update(
+        addressof(replay), addressof(fusion), *batch, batches, addresses.buffer_info()[0]
+    ):
+        return None
+    return weighing, fusion.highest, fusion.slot
+
+
+def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start: int) -> bool:
+    """Write new transitions from a slot on, with their signals and the highest priority.
+
+    Return False, and write nothing, for what PyTorch has to do, or find fault with.
+    """
+    table, count = sampler.table, len(data)
+    key = table.reward_key
+    columns: list[int] = []
+    values: list[Tensor] = []  # Kept until they are written.
+    if (
+        not sampler.compiled
+        or not 0 < count <= table.capacity
+        or any(signal != REWARD or signal.key != key for signal in table.written)
+        or not match_rows(stored, data, count, columns, values, absent=1)
+        or -1 in columns[WIDTH - 1 :: WIDTH]
+    ):
+        return False
+    reward, index = stored.get(key, None), stored.get(INDEX_KEY, None)
+    if index is None or index.dtype is not torch.long or reward is None:
+        return False
+    place = columns[::WIDTH].index(reward.data_ptr())
+    if reward.numel() != table.capacity or columns[WIDTH * place + WIDTH - 1] == 0:
+        return False
+    priority, replay = float(sampler._fresh_priority()), _replay(sampler)
+    array_of_columns = array("q", columns)
+    address = array_of_columns.buffer_info()[0]
+    if loops().write_new(
+        addressof(replay),
+        address,
+        len(columns) // WIDTH,
+        start,
+        count,
+        address + 8 * WIDTH * place,
+        index.data_ptr(),
+        table.column.get(REWARD.name, -1),
+        table.writes,
+        priority,
+        sampler._alpha,
+    ):
+        return False
+    table.writes += count
+    if sampler._highest is None:
+        sampler.keep_highest(priority, start)
+    return True
+
+
+@cache
+def _decay(size: int, sharpness: float) -> Tensor:
+    """Return the factors of Eq. (23) by place in a batch of one size, shape ``[B]``."""
+    return factors_by_place(size, sharpness, torch.double, torch.device("cpu"))
