@@ -60,14 +60,24 @@ def library() -> Any:
     """Return the compiled loops; None where there are none."""
     if os.environ.get("TORCHRL_MPFA_NATIVE") == "0":
         return None
+    compiled = _load(SOURCE.with_name(library_name()))
+    if compiled is None and (folder := _own_folder()) is not None:
+        path = folder / library_name()
+        compiled = _load(path)
+        if compiled is None and compile_library(path):
+            compiled = _load(path)
+    return compiled
+
+
+def _own_folder() -> Path | None:
+    """Return the user's folder of caches; None if there is none that only the user can write to."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_mpfa"
-    for path in (SOURCE.with_name(library_name()), folder / library_name()):
-        if path.exists() and (compiled := _load(path)) is not None:
-            return compiled
     try:
-        return _load(path) if compile_library(path) else None
-    except OSError:  # A folder of caches that cannot be written.
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o700)  # What lies there is executed.
+    except OSError:
         return None
+    return folder
 
 
 def loops() -> Any:
@@ -85,7 +95,7 @@ def loops() -> Any:
 
 
 def _load(path: Path) -> Any:
-    """Return the loops of a file; None if the file is damaged or of another machine."""
+    """Return the loops of a file; None if there is none, or one of another kind of machine."""
     try:
         compiled = ctypes.CDLL(str(path))
         for name, (result, arguments) in _FUNCTIONS.items():

@@ -29,7 +29,6 @@ def compile_library(target: Path) -> bool:
     compiler = next((words for words in names if words and shutil.which(words[0])), None)
     if compiler is None:
         return False
-    target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         made = Path(folder) / target.name
         command = [*compiler, *_OPTIONS, str(SOURCE), "-o", str(made), "-lm"]

@@ -208,13 +208,28 @@ def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
     buffer = make_buffer(16)
     buffer.extend(make_transitions(16))
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
-    assert list(tmp_path.iterdir()) == []
+    assert list((tmp_path / "torchrl_mpfa").iterdir()) == []
+
+
+def test_a_folder_of_caches_that_is_no_folder_leaves_it_to_pytorch(monkeypatch, tmp_path):
+    (tmp_path / "torchrl_mpfa").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.library.cache_clear()
+    assert native.library() is None
+
+
+def test_others_cannot_write_to_the_folder_of_what_is_loaded(monkeypatch, tmp_path):
+    (tmp_path / "torchrl_mpfa").mkdir(mode=0o777)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.library.cache_clear()
+    assert native.library() is not None
+    assert (tmp_path / "torchrl_mpfa").stat().st_mode & 0o777 == 0o700
 
 
 def test_a_compiler_that_fails_leaves_no_file(monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "false")
-    assert not compile_library(tmp_path / "folder" / "replay.so")
-    assert list((tmp_path / "folder").iterdir()) == []
+    assert not compile_library(tmp_path / "replay.so")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_library_is_compiled_again(monkeypatch, tmp_path):
