@@ -61,7 +61,8 @@ class RobotModel:
         turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
             as they can. Both wheels then change by the same, so that the forward speed stays.
         turn_acceleration: How fast its turn changes, where its wheels could change it faster
-            [rad/s²]; None: as they can.
+            [rad/s²]. Its controller then limits the forward speed apart from the turn, as
+            ``diff_drive_controller`` does. None: each wheel changes by itself.
         reverse: False if its controller does not let the body drive backwards; its wheels still
             turn it on the spot. Give the ``min_wheel_speed`` that this takes and no less, as a
             policy learns slowly where most actions turn it on the spot.

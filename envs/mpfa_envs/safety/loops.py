@@ -29,7 +29,7 @@ class Body(NamedTuple):
     repeat: int
     """Time steps from decision to decision."""
     braking: float
-    """How fast a wheel slows down [m/s²], which may be less than how fast it speeds up."""
+    """Share of its acceleration with which the robot slows down at least."""
     quick: WheelLimits
     """Limits of a robot that turns more quickly than it says; else the same as its limits."""
 
@@ -149,7 +149,7 @@ def _near_points(
     if body.limits.slow > 0.0:
         reach += 2.0 * _turning_radius(body.limits, body.wheel_base)
     else:
-        reach += 0.5 * fastest * fastest / body.braking
+        reach += 0.5 * fastest * fastest / (body.braking * body.limits.acceleration)
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
