@@ -109,7 +109,9 @@ class Pilot:
         late = self.robot.latency if latency is None else latency
         self.latency = check_not_negative("latency", late)
         mount = self.robot.lidar_mount if mount is None else mount
-        self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
+        self.sectors = Sectors(
+            card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
+        )
         self._network = network
         side = check_positive("map_size", map_size)
         self._map_size = side if card.memory == "map" else None
@@ -123,14 +125,12 @@ class Pilot:
             from mpfa_envs.deploy.map_path import MapPath
 
             self._map = MapPath(card)
-        body = body_of(card.robot, self.robot, self.pace)
-        self._limits = body.wheel_limits
-        self._keep = filter_of(card, self.robot, body, clearance)
+        self._body = body_of(card.robot, self.robot, self.pace)
+        self._keep = filter_of(card, self.robot, self._body, clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._plan: Plan | None = None
-        self._fresh_map = False
-        self._fresh = True
+        self._fresh_map, self._fresh = False, True
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -442,7 +442,7 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        limits, half = self._limits, 0.5 * self.card.robot.wheel_base
+        limits, half = self._body.wheel_limits, 0.5 * self.card.robot.wheel_base
         if math.isinf(min(limits.acceleration, limits.turning)):
             return wanted
         now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
