@@ -10,15 +10,17 @@ a seed and a kind of worlds.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from mpfa_envs import POLICIES, load_policy
+from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import RobotModel
-from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.report import table
@@ -43,12 +45,20 @@ def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]
         run = read_json(path.parents[1] / files.SETTINGS)
         planner = " ".join(asked[name] for name in ("policy", "memory") if name in asked)
         driver = {
-            "robot": resolve_robot(asked.get("robot") or run["environment"]["robot"]),
+            "robot": resolve_robot(asked.get("robot") or _trained_with(asked, run)),
             "driver": planner.removesuffix(" none") or asked["card"]["learner"],
             "seed": asked.get("card", asked)["seed"],
             "filter": "filter" in asked,
         }
         yield driver, read_table(path)
+
+
+def _trained_with(asked: Mapping[str, Any], run: Mapping[str, Any]) -> RobotChoice:
+    """The robot of an evaluation's policy: that of its run, or of a policy in the package."""
+    if run:
+        return run["environment"]["robot"]
+    [name] = [name for name in POLICIES if files.digest(policy_file(name)) == asked["sha256"]]
+    return load_policy(name).env_arguments["robot"]
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

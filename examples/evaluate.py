@@ -49,6 +49,7 @@ from mpfa_envs.safety.filter import CLEARANCE
 from training import files
 from training.evaluating import (
     Drivable,
+    add_filter,
     add_robot,
     check_physics,
     drive,
@@ -141,12 +142,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="time from a scan to the moment at which the wheels take the order (default: the "
         "robot's)",
     )
-    parser.add_argument(
-        "--filter",
-        action=argparse.BooleanOptionalAction,
-        help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
-        "policies that had it in all of their training)",
-    )
+    add_filter(parser)
     parser.add_argument(
         "--plan",
         choices=["unknown", "known"],

@@ -28,7 +28,7 @@ from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
 from training import files
-from training.evaluating import add_robot, as_trained, needs_filter, on_robot
+from training.evaluating import Drivable, add_filter, add_robot, filtered, needs_filter, on_robot
 
 TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""
@@ -49,6 +49,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--quantize", action="store_true", help="round weights to eight bits")
     add_robot(parser, "that of the policy")
     parser.add_argument("--world", default="test", help="where both drive (default: test)")
+    add_filter(parser)
     parser.add_argument(
         "--episodes", type=int, default=100, help="tasks that both drive; 0: none (default: 100)"
     )
@@ -58,6 +59,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.robot = options.robot and resolve_robot(options.robot)
         options.policy = on_robot(load_policy(options.path), options.robot)
+        if options.filter is None:
+            options.filter = needs_filter(options.policy)
+        if options.filter:
+            filtered(options.policy)
         world_tasks(options.world, episodes=1)
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -107,10 +112,9 @@ def largest_difference(one: Policy, other: Policy) -> float:
 
 
 def driven(policy: Policy, options: argparse.Namespace) -> dict[str, Any]:
-    """Drive a policy through the tasks, on exact arcs, behind the filter if it needs that."""
-    results = evaluate(
-        as_trained(policy), options.world, episodes=options.episodes, physics="kinematic"
-    )
+    """Drive a policy through the tasks, on exact arcs."""
+    driver: Drivable = filtered(policy) if options.filter else policy
+    results = evaluate(driver, options.world, episodes=options.episodes, physics="kinematic")
     rates = {
         name: sum(getattr(each, name) for each in results) / len(results)
         for name in ("success", "collision", "timeout")
@@ -144,11 +148,12 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         raise SystemExit(f"the file differs from the policy by {difference}: not written")
     if options.episodes:
         both = {"policy": driven(policy, options), "file": driven(exported, options)}
+        how = "behind the filter" if options.filter else "without the filter"
         for name, rates in both.items():
             shown = ", ".join(
                 f"{key} {rates[key]:.1%}" for key in ("success", "collision", "timeout")
             )
-            print(f"{name:6} {options.episodes} tasks in {options.world}: {shown}")
+            print(f"{name:6} {options.episodes} tasks in {options.world}, {how}: {shown}")
         same = [
             a == b for a, b in zip(*(each.pop("results") for each in both.values()), strict=True)
         ]
@@ -160,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
                 "world": options.world,
                 "episodes": options.episodes,
                 "physics": "kinematic",
-                "filter": needs_filter(policy),
+                "filter": options.filter,
                 "same": sum(same),
             }
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, BooleanOptionalAction
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
@@ -91,6 +91,16 @@ def evaluation_folder(
 def add_robot(parser: ArgumentParser, whose: str) -> None:
     """Add the option ``--robot``; ``whose`` says which robot is the default."""
     parser.add_argument("--robot", help=f"{', '.join(ROBOTS)} or a YAML file (default: {whose})")
+
+
+def add_filter(parser: ArgumentParser) -> None:
+    """Add the options ``--filter`` and ``--no-filter``."""
+    parser.add_argument(
+        "--filter",
+        action=BooleanOptionalAction,
+        help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
+        "policies that had it in all of their training)",
+    )
 
 
 def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:

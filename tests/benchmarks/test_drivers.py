@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 
 from benchmarks import drivers
+from mpfa_envs.policies.files import policy_file
+from training import files
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,14 +76,22 @@ def test_times_are_those_beside_a_dynamic_window_on_tasks_that_both_reach(evalua
     )
 
 
+def test_a_policy_of_the_package_drives_the_robot_that_it_was_trained_with(tmp_path):
+    sha = files.digest(policy_file("td3-burger"))
+    settings = {"card": {"learner": "td3", "seed": 102}, "sha256": sha, "filter": {}}
+    write_evaluation(tmp_path / "td3-burger", [True, True, True], **settings)
+    assert {row["robot"] for row in drivers.rows_of(tmp_path)} == {"burger"}
+
+
 def test_a_folder_without_evaluations_is_rejected(tmp_path, capsys):
     with pytest.raises(SystemExit):
         drivers.main([str(tmp_path)])
     assert f"{tmp_path} has no evaluations" in capsys.readouterr().err
 
 
-def test_the_page_has_the_tables_of_the_kept_rows(capsys):
-    drivers.main([str(ROOT / "docs/results/rooms/drivers.csv")])
+@pytest.mark.parametrize("kept", ["drivers.csv", "shipped.csv"])
+def test_the_page_has_the_tables_of_the_kept_rows(kept, capsys):
+    drivers.main([str(ROOT / "docs/results/rooms" / kept)])
     page = (ROOT / "docs/results/drivers.md").read_text(encoding="utf-8")
     for table in capsys.readouterr().out.strip().split("\n\n"):
         assert table in page

@@ -104,6 +104,13 @@ def test_orders_change_no_faster_than_the_policy_knows() -> None:
     assert at_once.ramp((0.0, 0.0), (0.5, 1.0), 0.0) == (0.5, 1.0)
 
 
+def test_orders_change_no_faster_than_a_controller_allows_that_limits_both_speeds_apart() -> None:
+    robot = replace(KOBUKI, name="own", turn_acceleration=2.0)
+    own = a_pilot((1.0, 1.0), robot=robot)
+    assert own.ramp((0.4, 0.0), (0.0, 1.0), 0.05) == pytest.approx((0.36, 0.1))
+    assert own.ramp((0.4, 0.0), (0.4, 1.0), 0.05) == pytest.approx((0.4, 0.1))
+
+
 @pytest.mark.parametrize("clearance", [None, 0.03])
 @pytest.mark.parametrize(
     ("half", "action", "drives"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from mpfa_envs.ros.controller import Controller
 
 KOBUKI = ROBOTS["kobuki"]
 SIDE, TICK, TURN = 0.25, 0.01, math.tau / 720
+SUMS = np.array([[0.5, -0.5], [0.5, 0.5]])
+"""From the wheels' speeds to their mean and half of their difference; twice its transpose: back."""
 PLAN = """
 ################################
 #..............#...............#
@@ -63,9 +66,12 @@ def scan(x: float, y: float, heading: float) -> Scan:
 
 def drive(
     driver: Pilot | Controller, start: tuple[float, float], goal: tuple[float, float],
-    *, late: float, strength: float = 1.0,
+    *, late: float, strength: float = 1.0, turning: float = 0.0,
 ) -> str:  # fmt: skip
-    """Drive to a goal with orders that arrive late [s], and say how it ended."""
+    """Drive to a goal with orders that arrive late [s], and say how it ended.
+
+    With ``turning`` [rad/s²] a controller limits forward speed and turn, each by itself.
+    """
     pilot = driver if isinstance(driver, Pilot) else driver.pilot
     (x, y), heading, wheels = start, 0.5, np.zeros(2)
     pilot.begin(goal, map_center=(4.0, 2.25))
@@ -92,7 +98,12 @@ def drive(
             orders.append((tick + round(late / TICK), np.array((told[0] - turn, told[0] + turn))))
         while orders and orders[0][0] <= tick:
             wanted = orders.pop(0)[1]
-        wheels = np.clip(wanted, wheels - change, wheels + change)
+        if turning:
+            most = np.array((change, 0.5 * KOBUKI.wheel_base * turning * TICK))
+            apart = (wheels @ SUMS, wanted @ SUMS)
+            wheels = np.clip(apart[1], apart[0] - most, apart[0] + most) @ SUMS.T * 2.0
+        else:
+            wheels = np.clip(wanted, wheels - change, wheels + change)
         heading += 0.5 * TICK * angular
         x, y = x + TICK * linear * math.cos(heading), y + TICK * linear * math.sin(heading)
         heading += 0.5 * TICK * angular
@@ -134,22 +145,57 @@ def test_numbers_that_are_a_little_off_touch_nothing(
     assert "touched" not in ends(pilot, late=0.2, strength=strength)
 
 
-def test_the_page_has_the_sums_of_the_rows() -> None:
-    docs, late = Path(__file__).parents[2] / "docs", ("0.0", "0.1", "0.2", "0.3")
-    kept: dict[tuple[str, str], dict[str, list[int]]] = {}
-    with (docs / "results/late.csv").open() as file:
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0.0, 0.2])
+@pytest.mark.parametrize("turning", [3.0, 6.0])
+@pytest.mark.parametrize("apart", [True, False])
+def test_a_robot_whose_file_limits_its_turn_arrives_by_whole_orders(
+    policy: Path, late: float, turning: float, apart: bool
+) -> None:
+    robot = replace(KOBUKI, name="own", turn_acceleration=turning)
+    pilot = Pilot.load(policy, robot=robot, clearance=0.03, latency=late)
+    reached = ends(pilot, late=late, turning=turning if apart else 0.0)
+    assert reached == ["arrived"] * len(TASKS)
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+Sums = dict[tuple[str, ...], dict[str, list[int]]]
+
+
+def kept(*names: str, exact: bool) -> Sums:
+    """Arrived, tasks and touched of the bench's rows by latency, of pilots that know all or not."""
+    sums: Sums = {}
+    with (DOCS / "results/late.csv").open() as file:
         for drives in csv.DictReader(file):
-            row = kept.setdefault((drives["driver"], drives["policy"]), {})
-            sums = row.setdefault(drives["latency"], [0, 0, 0])
-            for place, name in enumerate(("arrived", "tasks", "touched")):
-                sums[place] += int(drives[name])
-    text = (docs / "robot.md").read_text(encoding="utf-8").partition("Late orders, measured:")[2]
+            known = drives["told"] == drives["latency"] and drives["strength"] == "1.0"
+            off = f"{float(drives['told']) - float(drives['latency']):+.2f}"
+            drives["off"] = off.replace("+0.00", "0")
+            if known == exact:
+                row = sums.setdefault(tuple(drives[name] for name in names), {})
+                cell = row.setdefault(drives["latency"], [0, 0, 0])
+                for place, name in enumerate(("arrived", "tasks", "touched")):
+                    cell[place] += int(drives[name])
+    return sums
+
+
+@pytest.mark.parametrize(
+    ("before", "names", "latencies", "exact"),
+    [
+        ("Late orders, measured:", ("driver", "policy"), ("0.0", "0.1", "0.2", "0.3"), True),
+        ("less than the file says:", ("off", "strength"), ("0.1", "0.2"), False),
+    ],
+)
+def test_the_page_has_the_sums_of_the_rows(
+    before: str, names: tuple[str, ...], latencies: tuple[str, ...], exact: bool
+) -> None:
+    rows = kept(*names, exact=exact)
+    text = (DOCS / "robot.md").read_text(encoding="utf-8").partition(before)[2]
     table = text.strip().partition("\n\n")[0].splitlines()[2:]
-    assert len(table) == len(kept) > 4
+    assert len(table) == len(rows) > 2
     for line in table:
-        driver, policy, *cells, touched = (cell.strip("` ") for cell in line.strip("|").split("|"))
-        row = kept[driver.lower(), policy]
-        shown = [f"{row[time][0]} of {row[time][1]}" if time in row else "-" for time in late]
+        first, second, *cells, touched = (cell.strip("` ") for cell in line.strip("|").split("|"))
+        row = rows[first.lower(), second]
+        shown = [f"{row[time][0]} of {row[time][1]}" if time in row else "-" for time in latencies]
         assert cells == shown and int(touched) == sum(sums[2] for sums in row.values())
 
 

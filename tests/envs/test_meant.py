@@ -93,6 +93,7 @@ def test_a_robot_file_in_millimeters_is_rejected_at_its_line(tmp_path: Path) -> 
     [
         ("wheel_separation", "wheel_base"),
         ("robot_radius", "radius"),
+        ("diameter", "radius"),
         ("range_max", "lidar_range"),
         ("wheel_diameter", "wheel_radius"),
         ("max_angular_speed", "turn_limit"),

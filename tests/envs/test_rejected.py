@@ -154,6 +154,10 @@ ROBOT: Rows = [
     ({"mass": True}, "mass must be a finite number, got True"),
     ({"name": ""}, "name must be a non-empty string, got ''"),
     ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
+    (
+        {"lidar_mount": (0.3, 0.0, 0.0)},
+        r"lidar_mount must be .* the radius 0.18 m .*got \(0.3, 0\)",
+    ),
     ({"wheel_radius": 0.3}, "wheel_radius must be at most half the height"),
     ({"min_wheel_speed": 0.5}, "min_wheel_speed must be below max_wheel_speed = 0.5, got 0.5"),
 ]
@@ -201,6 +205,7 @@ PILOT: Rows = [
     ({"pace": 0.0}, "pace must be above 0"),
     ({"silent": "near"}, "silent must be one of"),
     ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, .*got 2"),
+    ({"mount": (0.0, 0.2, 0.0)}, r"mount must be at most the radius 0.18 m .*got \(0, 0.2\)"),
     ({"unseen": -1.0}, "unseen must be positive, got -1.0"),
     ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
 ]

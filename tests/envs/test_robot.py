@@ -113,6 +113,16 @@ def test_a_robot_with_a_limited_turn_begins_to_turn_while_it_drives_off() -> Non
     assert speeds[-1] == pytest.approx((0.3, math.pi))
 
 
+def test_a_controller_that_limits_the_turn_limits_the_forward_speed_apart_from_it() -> None:
+    robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, turn_acceleration=4.0)
+    # Slower by 0.3 m/s, and a turn by 1 rad/s: for the left wheel far more than for the right one.
+    turn = 0.5 * robot.wheel_base
+    speeds = driven_from(robot, (0.5, 0.5), (0.2 - turn, 0.2 + turn))
+    steps = np.arange(1, 51)
+    assert speeds[:, 0] == pytest.approx(np.maximum(0.5 - 0.02 * steps, 0.2))
+    assert speeds[:, 1] == pytest.approx(np.minimum(0.08 * steps, 1.0))
+
+
 @pytest.mark.parametrize(
     ("action", "forward", "turn"),
     [((-1, -1), 0.0, 0.0), ((-1, 0), 0.0, 1.75), ((-1, 1), 0.2, 3.5), ((0, 1), 0.55, 1.75)],

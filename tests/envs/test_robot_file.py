@@ -90,6 +90,7 @@ def test_a_robot_comes_back_from_its_file_and_its_fields(robot: RobotModel, tmp_
         ("lidar_rays: 10.5", "lidar_rays must be a positive integer, got 10.5"),
         ("lidar_range: 0", "lidar_range must be positive, got 0.0"),
         ("lidar_mount: 3", "lidar_mount must be a list"),
+        ("lidar_mount: [0.3, 0, 0]", r"lidar_mount must be .* radius 0.28 m .*got \(0.3, 0\)"),
         ("lidar_mount: [1, 2]", "lidar_mount must be 3 numbers, .* got 2"),
         ("lidar_mount: [0, 0, 0, 1]", "lidar_mount must have a roll of 0 or π, .* got 1.0"),
     ],

@@ -138,6 +138,17 @@ def test_a_robot_drives_in_a_hall_wherever_its_lidar_is(x: float, view: float) -
     assert keep(observed(TaskConfig(robot=robot), 10.0), ahead).tolist() == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("view", [180.0, 240.0, 300.0])
+def test_a_robot_that_turns_with_a_rounded_speed_may_stop(view: float) -> None:
+    changes = {"lidar_mount": (0.12, 0.0, 0.0), "wheel_acceleration": 0.3}
+    robot = replace(ROBOTS["kobuki"], field_of_view=view, **changes)
+    config = TaskConfig(robot=robot)
+    seen, stand = observed(config, 8.0), np.zeros(2, np.float32)
+    seen[..., config.observation_slices["linear_speed"]] = 1e-8
+    seen[..., config.observation_slices["angular_speed"]] = -0.95
+    assert config.make_filter()(seen, stand).tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("view", [180.0, 270.0])
 @pytest.mark.parametrize("world", ["mazes", "rooms"])
 def test_a_random_policy_does_not_drive_into_what_it_does_not_see(world: str, view: float) -> None:

@@ -21,8 +21,23 @@ _PARTS: Final = 5
 """Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
 
 
+def body_of(learned: RobotModel, robot: RobotModel, pace: float) -> RobotModel:
+    """The robot of the training, with what the robot that drives it at a pace cannot do."""
+    braking = robot.wheel_limits.acceleration / widening(robot, learned)
+    braking = min(learned.wheel_limits.acceleration, braking / pace**2)
+    turns = min(turning(learned), turning(robot) / pace**2)
+    return replace(
+        learned,
+        radius=max(robot.radius, 0.5 * learned.wheel_base),
+        wheel_acceleration=None if math.isinf(braking) else braking,
+        deceleration=None,
+        turn_acceleration=None if math.isinf(turns) else turns,
+        reverse=learned.reverse and robot.reverse,
+    )
+
+
 def filter_of(
-    card: Card, robot: RobotModel, pace: float, clearance: float | None
+    card: Card, robot: RobotModel, body: RobotModel, clearance: float | None
 ) -> SafetyFilter | None:
     """The filter of the task that a policy learned, for the robot that drives; None: no filter."""
     learned = card.robot
@@ -35,16 +50,6 @@ def filter_of(
             f"nothing, got {clearance}"
         )
     check_view(robot, robot.field_of_view)
-    braking = robot.wheel_limits.acceleration / widening(robot, learned)
-    braking = min(learned.wheel_limits.acceleration, braking / pace**2)
-    turns = min(turning(learned), turning(robot) / pace**2)
-    body = replace(
-        learned,
-        radius=max(robot.radius, 0.5 * learned.wheel_base),
-        wheel_acceleration=None if math.isinf(braking) else braking,
-        turn_acceleration=None if math.isinf(turns) else turns,
-        reverse=learned.reverse and robot.reverse,
-    )
     repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
     rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
     return SafetyFilter(

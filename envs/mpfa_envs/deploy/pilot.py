@@ -10,7 +10,7 @@ import numpy as np
 from mpfa_envs.checks import check_not_negative, check_number, check_positive
 from mpfa_envs.deploy.arrival import Arrival
 from mpfa_envs.deploy.card import Card, check_finite, read_exported
-from mpfa_envs.deploy.keeping_off import filter_of
+from mpfa_envs.deploy.keeping_off import body_of, filter_of
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.pace import pace_of, tolerance
 from mpfa_envs.deploy.places import check_on_map, pair_of, placed, sides_of
@@ -109,7 +109,9 @@ class Pilot:
         late = self.robot.latency if latency is None else latency
         self.latency = check_not_negative("latency", late)
         mount = self.robot.lidar_mount if mount is None else mount
-        self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
+        self.sectors = Sectors(
+            card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
+        )
         self._network = network
         side = check_positive("map_size", map_size)
         self._map_size = side if card.memory == "map" else None
@@ -123,12 +125,12 @@ class Pilot:
             from mpfa_envs.deploy.map_path import MapPath
 
             self._map = MapPath(card)
-        self._keep = filter_of(card, self.robot, self.pace, clearance)
+        self._body = body_of(card.robot, self.robot, self.pace)
+        self._keep = filter_of(card, self.robot, self._body, clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._plan: Plan | None = None
-        self._fresh_map = False
-        self._fresh = True
+        self._fresh_map, self._fresh = False, True
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -430,7 +432,7 @@ class Pilot:
     def ramp(
         self, last: tuple[float, float], wanted: tuple[float, float], passed: float
     ) -> tuple[float, float]:
-        """Change the speeds to order no faster than the policy knows.
+        """Change the speeds to order no faster than the policy knows and the robot can.
 
         Args:
             last: Forward and turning speed ordered last [m/s, rad/s].
@@ -440,10 +442,9 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        limits = self.card.robot.wheel_limits
+        limits, half = self._body.wheel_limits, 0.5 * self.card.robot.wheel_base
         if math.isinf(min(limits.acceleration, limits.turning)):
             return wanted
-        half = 0.5 * self.card.robot.wheel_base
         now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
-        left, right = changed(now, to, limits, limits.acceleration, passed * self.pace**2)
+        left, right = changed(now, to, limits, 1.0, passed * self.pace**2)
         return 0.5 * (left + right), 0.5 * (right - left) / half

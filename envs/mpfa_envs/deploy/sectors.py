@@ -111,6 +111,8 @@ class Sectors:
             may report the same for what is too near, a return within 0.08 m of ``range_min`` then
             stays where it was until its ray is valid again. A scan without any valid ray is a hall
             wider than the lidar sees, unless the scan before met something well within its range.
+        radius: Of the robot that carries the sensor, which is within it [m]; None: that of the
+            robot in training.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -123,9 +125,11 @@ class Sectors:
         mount: tuple[float, ...] = (0.0, 0.0, 0.0),
         unseen: float | None = None,
         silent: Silent = "reject",
+        radius: float | None = None,
     ) -> None:
         self.card = card
-        *place, roll = (*check_mount("mount", mount), 0.0)[:4]
+        rim = card.robot.radius if radius is None else check_positive("radius", radius)
+        *place, roll = (*check_mount("mount", mount, rim), 0.0)[:4]
         self.mount = tuple(place)
         self._side = 1.0 if abs(roll) < 1.0 else -1.0
         self.unseen = None if unseen is None else check_positive("unseen", unseen)

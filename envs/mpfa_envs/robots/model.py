@@ -48,7 +48,8 @@ class RobotModel:
 
     Args:
         name: Name in error messages.
-        radius: Radius of the footprint [m].
+        radius: Radius of the footprint, half of its diameter: from the middle of the axle to the
+            farthest point of the robot [m].
         height: Height of the body [m].
         mass: Mass of the whole robot [kg].
         wheel_base: Distance between the two wheels [m].
@@ -61,7 +62,8 @@ class RobotModel:
         turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
             as they can. Both wheels then change by the same, so that the forward speed stays.
         turn_acceleration: How fast its turn changes, where its wheels could change it faster
-            [rad/s²]; None: as they can.
+            [rad/s²]. Its controller then limits the forward speed apart from the turn, as
+            ``diff_drive_controller`` does. None: each wheel changes by itself.
         reverse: False if its controller does not let the body drive backwards; its wheels still
             turn it on the spot. Give the ``min_wheel_speed`` that this takes and no less, as a
             policy learns slowly where most actions turn it on the spot.
@@ -73,7 +75,8 @@ class RobotModel:
         lidar_range: A ray that meets nothing within this distance reports this distance [m].
         lidar_mount: Position (x, y) of the lidar and direction of its x axis in the robot's frame
             [m, m, rad], and its roll, if it has one: 0, or ±π upside down [rad]. Rays begin
-            there. A pilot turns scans by the angles, and in training the lidar looks ahead.
+            there, within the radius. A pilot turns scans by the angles, and in training the lidar
+            looks ahead.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s].
 
@@ -113,7 +116,6 @@ class RobotModel:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
-        object.__setattr__(self, "lidar_mount", check_mount("lidar_mount", self.lidar_mount))
         check_choice("reverse", self.reverse, Literal[True, False])
         if self.lidar_rays is not None:
             check_count("lidar_rays", self.lidar_rays)
@@ -124,6 +126,8 @@ class RobotModel:
             check = {"min_wheel_speed": check_number, "latency": check_not_negative}
             check.get(field.name, check_positive)(field.name, value)
         keep(self, *(field.name for field in fields(self)[1:] if field.name not in _CHECKED[1:]))
+        mount = check_mount("lidar_mount", self.lidar_mount, self.radius)
+        object.__setattr__(self, "lidar_mount", mount)
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"
@@ -263,8 +267,8 @@ class RobotModel:
         return "\n".join([*parts, "</robot>"])
 
 
-def check_mount(name: str, mount: Any) -> tuple[float, ...]:
-    """Check a pose (x, y, yaw) of a level lidar, or one with its roll [m, m, rad, rad]."""
+def check_mount(name: str, mount: Any, radius: float) -> tuple[float, ...]:
+    """Check a pose (x, y, yaw) of a robot's level lidar, or one with its roll [m, m, rad, rad]."""
     try:
         found = tuple(check_number(name, value) for value in mount)
     except TypeError:
@@ -278,6 +282,12 @@ def check_mount(name: str, mount: Any) -> tuple[float, ...]:
     roll = abs(found[3]) if found[3:] else 0.0
     if min(roll, abs(roll - math.pi)) > _LEVEL:
         raise ValueError(f"{name} must have a roll of 0 or π, as scans are level, got {found[3]}")
+    if math.hypot(*found[:2]) > radius:
+        raise ValueError(
+            f"{name} must be at most the radius {radius:g} m away from the middle of the axle, got "
+            f"({found[0]:g}, {found[1]:g}): the radius reaches to the farthest point of the robot, "
+            "its lidar included"
+        )
     return found
 
 

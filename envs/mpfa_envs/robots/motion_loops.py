@@ -25,7 +25,7 @@ class WheelLimits(NamedTuple):
     acceleration: float
     """Acceleration of a wheel [m/s²]."""
     turning: float = math.inf
-    """By how much that difference changes at most [m/s²]."""
+    """By how much that difference changes at most [m/s²], and apart from the mean of both."""
     reverse: bool = True
     """False if the mean of both is never below 0."""
 
@@ -83,21 +83,19 @@ def changed(
     now: tuple[float, float],  # [m/s]
     wanted: tuple[float, float],  # [m/s]
     limits: WheelLimits,
-    braking: float,  # how fast a wheel slows down [m/s²]
+    share: float,  # of the acceleration, with which it slows down
     time: float,  # [s]
 ) -> tuple[float, float]:
     """The speeds nearest to the wanted ones that the wheels can have after a time [m/s]."""
     left, right = now
-    most = limits.turning * time
-    to_left = _changed(left, wanted[0], limits.acceleration * time, braking * time)
-    to_right = _changed(right, wanted[1], limits.acceleration * time, braking * time)
-    across = 0.5 * ((to_right - right) - (to_left - left))
-    # The forward speed changes as it would, and the turn as fast as it may.
-    if abs(across) > most:
-        forward = 0.5 * ((to_right - right) + (to_left - left))
-        across = math.copysign(most, across)
-        to_left, to_right = left + forward - across, right + forward + across
-    return to_left, to_right
+    faster, slower = limits.acceleration * time, share * limits.acceleration * time
+    if limits.turning == math.inf:
+        return _changed(left, wanted[0], faster, slower), _changed(right, wanted[1], faster, slower)
+    # A controller that limits the turn limits the forward speed, too, and each by itself.
+    forward = _changed(0.5 * (left + right), 0.5 * (wanted[0] + wanted[1]), faster, slower)
+    faster, slower = min(faster, limits.turning * time), min(slower, share * limits.turning * time)
+    across = _changed(0.5 * (right - left), 0.5 * (wanted[1] - wanted[0]), faster, slower)
+    return forward - across, forward + across
 
 
 @njit
@@ -113,9 +111,7 @@ def accelerate(
         if running[robot]:
             to = limited(wanted[robot, 0], wanted[robot, 1], limits)
             now = speeds[robot, 0], speeds[robot, 1]
-            speeds[robot, 0], speeds[robot, 1] = changed(
-                now, to, limits, limits.acceleration, time_step
-            )
+            speeds[robot, 0], speeds[robot, 1] = changed(now, to, limits, 1.0, time_step)
 
 
 @njit
@@ -164,7 +160,7 @@ def drive_orders(
         parts = math.ceil(times[order] / time_step - 1e-9)
         part = times[order] / parts
         for _ in range(parts):
-            left, right = changed((left, right), to, limits, limits.acceleration, part)
+            left, right = changed((left, right), to, limits, 1.0, part)
             turn, along = (right - left) / wheel_base * part, 0.5 * (left + right) * part
             x += along * math.cos(heading + 0.5 * turn)
             y += along * math.sin(heading + 0.5 * turn)

@@ -56,7 +56,9 @@ class Orders:
         limits = self._robot.wheel_limits
         assumed = [(latency, limits)]
         if not certain:
-            slow = limits._replace(acceleration=STRENGTH * limits.acceleration)
+            slow = limits._replace(
+                acceleration=STRENGTH * limits.acceleration, turning=STRENGTH * limits.turning
+            )
             early, quick = max(latency - _OFF, 0.0), limits._replace(turning=math.inf)
             assumed += [(latency + _OFF, slow), (early, quick)]
         rows = [

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _ELSEWHERE: Final = {
     "wheel_separation": "wheel_base",
     "track_width": "wheel_base",
-    "robot_radius": "radius",
+    **dict.fromkeys(("robot_radius", "diameter", "robot_diameter", "width"), "radius"),
     "max_vel_x": "max_wheel_speed",
     "min_vel_x": "min_wheel_speed",
     "max_velocity": "max_wheel_speed",

@@ -119,7 +119,7 @@ class SafetyFilter:
             check_not_negative("clearance", clearance),
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
-            check_positive("braking", check_share("braking", braking)) * limits.acceleration,
+            check_positive("braking", check_share("braking", braking)),
             limits if braking == 1.0 else limits._replace(turning=math.inf),
         )
         reach = _reach(self._body) + math.hypot(*mount)
@@ -252,7 +252,8 @@ def _unseen(
 def _reach(body: Body) -> float:
     """Distance of the farthest point that a robot may come to before it stands [m]."""
     fastest = max(abs(body.limits.slow), abs(body.limits.fast))
-    time = body.repeat * body.time_step + 0.5 * fastest / body.braking
+    braking = body.braking * body.limits.acceleration
+    time = body.repeat * body.time_step + 0.5 * fastest / braking
     return fastest * time + body.radius + body.clearance
 
 

@@ -29,7 +29,7 @@ class Body(NamedTuple):
     repeat: int
     """Time steps from decision to decision."""
     braking: float
-    """How fast a wheel slows down [m/s²], which may be less than how fast it speeds up."""
+    """Share of its acceleration with which the robot slows down at least."""
     quick: WheelLimits
     """Limits of a robot that turns more quickly than it says; else the same as its limits."""
 
@@ -50,6 +50,9 @@ _GAIN = 0.001
 """Clearance that a robot gains at least that is ordered away from what is too near [m]."""
 _TOUCH = 1e-9
 """Rounding of distances [m]."""
+_AT_RIM = 1e-6
+"""The same of what is at the rim, as what is not seen: speeds of an observation are rounded, and a
+robot that turns could not stop for the nanometers that it drives then."""
 
 
 @njit
@@ -149,7 +152,7 @@ def _near_points(
     if body.limits.slow > 0.0:
         reach += 2.0 * _turning_radius(body.limits, body.wheel_base)
     else:
-        reach += 0.5 * fastest * fastest / body.braking
+        reach += 0.5 * fastest * fastest / (body.braking * body.limits.acceleration)
     kept = body.radius + body.clearance
     count = 0
     for ray in range(ranges.shape[0]):
@@ -166,7 +169,8 @@ def _near_points(
             room = away - body.radius
             left = min(_LEAST * body.clearance, (1.0 - creep) * room)
             left = max(left, (1.0 - _SHARE) * room)
-            distance = min(away, kept, body.radius + left) - _TOUCH
+            touch = _TOUCH if room > _AT_RIM else _AT_RIM
+            distance = min(away, kept, body.radius + left) - touch
             points[count, 2] = distance * distance
             count += 1
     return count
