@@ -62,7 +62,7 @@ batch["signals"] = TensorDict(
     {"td_error": torch.rand(4), "action_gradient": torch.rand(4)}, [4]
 )
 buffer.update_tensordict_priority(batch)
-print("weights of the signals:", buffer.sampler.weights)
+print("weights of the signals:", buffer.sampler.weights, "compiled:", buffer.sampler.compiled)
 
 shipped = {name: load_policy(name) for name in POLICIES}
 print("shipped policies:", ", ".join(shipped))
