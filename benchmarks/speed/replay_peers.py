@@ -1,8 +1,15 @@
-"""Replay of this package beside cpprb, in C++, and flashbax, in JAX, where these are installed."""
+"""Replay of this package beside cpprb, in C++, flashbax, in JAX, and TorchRL.
+
+    python -m benchmarks.speed.replay_peers CHART.png    draws the times of 1e5 and 1e6 transitions
+
+The first two come with the extra ``peers``, and are left out where they are not installed.
+"""
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 
@@ -14,8 +21,11 @@ from benchmarks.speed.replay import (
     OBSERVATION_SIZE,
     make_mpfa_buffer,
     make_mpfa_update,
+    make_stock_buffer,
+    make_stock_update,
 )
 from benchmarks.speed.timing import MICROSECONDS, Call, Entry, entry, take_turns
+from mpfa_envs.render.charts import finish, new_figure
 
 _AT_ONCE = 100_000
 
@@ -83,7 +93,16 @@ def make_flashbax_update(capacity: int) -> Call:
     return update
 
 
-_MAKERS = {"cpprb": make_cpprb_update, "flashbax": make_flashbax_update}
+def make_torchrl_update(capacity: int) -> Call:
+    """The same with TorchRL's prioritized replay."""
+    return make_stock_update(make_stock_buffer(capacity))
+
+
+_MAKERS = {
+    "cpprb": make_cpprb_update,
+    "flashbax": make_flashbax_update,
+    "torchrl": make_torchrl_update,
+}
 
 
 def measure(name: str = "replay_1e5", *, capacity: int = 100_000, quick: bool) -> list[Entry]:
@@ -100,3 +119,25 @@ def measure(name: str = "replay_1e5", *, capacity: int = 100_000, quick: bool) -
     ratio = None if baseline is None else ours.ratio(timings[baseline])
     value = ours.median * MICROSECONDS
     return [*entries, entry(name, value, "us", ratio=ratio, baseline=baseline)]
+
+
+def draw(path: Path) -> None:
+    """Measure buffers of two sizes, and draw the times as bars."""
+    sizes = {"100,000": 100_000, "1,000,000": 1_000_000}
+    figure, panels = new_figure(1, len(sizes), panel=(4.2, 2.2), sharey=True)
+    for axes, (title, capacity) in zip(panels, sizes.items(), strict=True):
+        entries = measure("replay", capacity=capacity, quick=False)
+        names = {"replay": "torchrl-mpfa, three signals", "replay_torchrl": "TorchRL"}
+        labels = [names.get(e["name"], e["name"].removeprefix("replay_")) for e in entries]
+        values = [e["value"] for e in entries]
+        colors = ["tab:blue" if e["name"] == "replay" else "tab:gray" for e in entries]
+        bars = axes.barh(labels, values, color=colors)
+        axes.bar_label(bars, fmt="%.0f", padding=3)
+        axes.set(title=f"of {title} transitions", xlabel="CPU time [µs]")
+        axes.set_xlim(0.0, 1.2 * max(values))
+    figure.suptitle("Sample 256 transitions and update their priorities")
+    finish(figure, [], path)
+
+
+if __name__ == "__main__":
+    draw(Path(sys.argv[1]))

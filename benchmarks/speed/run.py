@@ -40,14 +40,14 @@ from torchrl_mpfa.saving import write_text_atomically
 LATEST = Path(__file__).with_name("latest.json")
 
 TARGETS: Mapping[str, float] = {
-    "sample_update_1e5": 1.00,
-    "sample_update_1e6": 1.00,
-    "sample_16x256": 1.00,
+    "sample_update_1e5": 0.50,
+    "sample_update_1e6": 0.50,
+    "sample_16x256": 0.60,
     "replay_1e5": 0.50,
     "replay_1e6": 0.50,
-    "iteration_4x256": 0.80,
-    "extend_one": 1.15,
-    "extend_16": 1.15,
+    "iteration_4x256": 0.50,
+    "extend_one": 0.30,
+    "extend_16": 0.30,
     "loss": 0.92,
     "train_step": 0.90,
     "sb3_step": 0.90,
