@@ -77,7 +77,7 @@ def sample_compiled(
     replay = _replay(sampler)
     wrong = loops().sample(
         addressof(replay),
-        size,
+        min(size, sampler.table.capacity),
         shares.data_ptr(),
         shares.numel(),
         sampler._beta,
@@ -102,24 +102,24 @@ def update_compiled(
     None, and nothing changes, for what PyTorch has to do, or find fault with.
     """
     table, count = sampler.table, slots.numel()
-    if type(batches) is not int or batches < 1 or count % batches:
+    if type(batches) is not int or batches < 1 or count % batches or not slots.is_cpu:
         return None
     values = []
     for signal in table.learned:
         value = signals.get(signal.name)
-        if value is None or value.dtype is not torch.float or value.numel() != count:
+        if value is None or not _fits(value, torch.float, count):
             return None
         values.append(value.contiguous())
     if written_at is None:
         filled = table.size
-    elif written_at.dtype is torch.double and written_at.numel() == count:
+    elif _fits(written_at, torch.double, count):
         filled, written_at = max(table.size, table.cleared), written_at.contiguous()
     else:
         return None
     slots, replay = slots.contiguous(), _replay(sampler)
     batch = slots.data_ptr(), count
     written = None if written_at is None else written_at.data_ptr()
-    if loops().stale(addressof(replay), filled, *batch, written):
+    if loops().stale(addressof(replay), min(filled, table.capacity), *batch, written):
         return None
     first = slots if batches == 1 else slots[: count // batches]
     weighing = weigh(sampler, first, sampler._weighing)  # Eqs. (15)-(20).
@@ -131,7 +131,7 @@ def update_compiled(
             bound, boost = _BOUNDS[adjust.bound], float(adjust.factor(counted))
         elif isinstance(adjust, PositiveDecay):
             decay = _decay(count // batches, adjust.sharpness)
-    weights = weighing.weights
+    weights = weighing.weights.contiguous()
     fusion = Fusion(
         weights.data_ptr(),
         weights.numel(),
@@ -165,12 +165,14 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
         not sampler.compiled
         or not 0 < count <= table.capacity
         or any(signal != REWARD or signal.key != key for signal in table.written)
+        # It is the one entry that may be absent.
+        or data.get(INDEX_KEY, None) is not None
         or not match_rows(stored, data, count, columns, values, absent=1)
         or -1 in columns[WIDTH - 1 :: WIDTH]
     ):
         return False
     reward, index = stored.get(key, None), stored.get(INDEX_KEY, None)
-    if index is None or index.dtype is not torch.long or reward is None:
+    if index is None or reward is None or not _fits(index, torch.long, table.capacity):
         return False
     place = columns[::WIDTH].index(reward.data_ptr())
     if reward.numel() != table.capacity or columns[WIDTH * place + WIDTH - 1] == 0:
@@ -196,6 +198,11 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
     if sampler._highest is None:
         sampler.keep_highest(priority, start)
     return True
+
+
+def _fits(value: Tensor, dtype: torch.dtype, count: int) -> bool:
+    """Return True if a tensor on the CPU has so many numbers of a type."""
+    return value.is_cpu and value.dtype is dtype and value.numel() == count
 
 
 @cache

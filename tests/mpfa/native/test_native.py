@@ -7,12 +7,16 @@ import sys
 
 import pytest
 import torch
+from torchrl.data import LazyTensorStorage
 
 from tests.mpfa.native.paths import PATHS, take
+from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import make_buffer, make_transitions, seeded, write_signals
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,
+    Fusion,
+    MPFASampler,
     PositiveBoost,
     PositiveDecay,
     SignalReplayBuffer,
@@ -175,6 +179,49 @@ def test_a_number_that_is_not_finite_is_rejected_and_nothing_written(number, dty
         buffer.extend(wrong)
     assert buffer.writer._cursor == len(buffer) == 4
     assert torch.equal(before["_sampler"]["_sum_tree"], buffer.sampler.state_dict()["_sum_tree"])
+
+
+def test_an_entry_is_missed_also_where_the_rows_have_an_index(monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16)
+    buffer.extend(make_transitions(4))
+    rows = make_transitions(4).exclude("observation").set("index", torch.arange(4))
+    with pytest.raises(KeyError, match="'observation' is missing"):
+        buffer.extend(rows)
+    assert len(buffer) == 4
+
+
+def test_weights_of_a_fusion_that_share_one_number_count_for_each_signal(monkeypatch):
+    class Equal(Fusion):
+        def weights(self, names, table, index):
+            return torch.tensor([0.5], dtype=torch.double).expand(len(names))
+
+    found = []
+    for path in PATHS:
+        _, buffer = stream(path, monkeypatch, {"fusion": Equal()}, rounds=5)
+        found.append(buffer.sampler.priorities())
+    torch.testing.assert_close(*found, rtol=1e-12, atol=0.0, equal_nan=True)
+
+
+def test_a_storage_larger_than_its_sampler_samples_no_slot_outside_of_it(monkeypatch):
+    take("compiled", monkeypatch)
+    storage, sampler = LazyTensorStorage(50), MPFASampler(10)
+    storage.set(range(50), make_transitions(50))
+    sampler.mark_update(torch.arange(10), storage=storage)
+    slots, _ = sampler.sample(storage, 1000)
+    assert slots.max() < 10
+
+
+def test_signals_on_another_device_are_learned_from(monkeypatch, second_device):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16)
+    buffer.extend(make_transitions(16))
+    batch = write_signals(buffer.sample())
+    expected = copy.deepcopy(buffer)
+    expected.update_tensordict_priority(batch)
+    buffer.update_tensordict_priority(batch.to(DEVICE))
+    priorities = [part.sampler.priorities() for part in (buffer, expected)]
+    torch.testing.assert_close(*priorities, rtol=1e-12, atol=0.0)
 
 
 def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(monkeypatch):
