@@ -23,10 +23,18 @@ enum {
 
 static inline double least(double a, double b) { return a < b ? a : b; }
 
+static int64_t outside(const int64_t *slots, int64_t n, int64_t end) {
+  int64_t wrong = 0;
+  for (int64_t i = 0; i < n; i++) wrong |= slots[i] < 0 || slots[i] >= end;
+  return wrong;
+}
+
 // Trees.
 
-void set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, const int64_t *slots,
-                const double *leaf, int64_t n) {
+// Returns 1, and writes nothing, if a slot is not below `size`.
+int64_t set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, int64_t size,
+                   const int64_t *slots, const double *leaf, int64_t n) {
+  if (outside(slots, n, size)) return 1;
   for (int64_t i = 0; i < n; i++) t[(width | slots[i]) * stride] = leaf[i];
   // Level by level, so that no slot waits for another; of a narrow level all nodes.
   for (int shift = 1; width >> shift; shift++) {
@@ -37,6 +45,7 @@ void set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, const
       t[k * stride] = minimum ? least(a, b) : a + b;
     }
   }
+  return 0;
 }
 
 double query(const double *t, int64_t stride, int64_t width, int64_t minimum, int64_t size,
@@ -76,12 +85,6 @@ void find(const double *t, int64_t stride, int64_t width, int64_t size, int64_t 
 }
 
 // Rows of transitions.
-
-static int64_t outside(const int64_t *slots, int64_t n, int64_t end) {
-  int64_t wrong = 0;
-  for (int64_t i = 0; i < n; i++) wrong |= slots[i] < 0 || slots[i] >= end;
-  return wrong;
-}
 
 // Both return 1, and do nothing, if a slot is not below `end`.
 int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {

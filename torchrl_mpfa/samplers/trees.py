@@ -49,9 +49,10 @@ class CompiledTree:
         return self.nodes.select(1, self._column)[slots + self.width]
 
     def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
-        slots, leaf = slots.contiguous(), leaf.contiguous()
+        slots, leaf = slots.contiguous(), leaf.double().expand(slots.shape).contiguous()
         batch = slots.data_ptr(), leaf.data_ptr(), slots.numel()
-        loops().set_leaves(*self._place, self.MINIMUM, *batch)
+        if loops().set_leaves(*self._place, self.MINIMUM, self.size, *batch):
+            raise IndexError(f"slots must be in [0, {self.size}), got {slots.tolist()}")
 
     def query(self, start: int, end: int) -> float:
         """Return the sum or minimum of the leaves from ``start`` to before ``end``."""

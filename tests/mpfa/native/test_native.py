@@ -24,6 +24,7 @@ from torchrl_mpfa import (
     native,
 )
 from torchrl_mpfa.native.build import compile_library
+from torchrl_mpfa.samplers.trees import SumTree
 
 CAPACITY, BATCH = 37, 8
 
@@ -222,6 +223,18 @@ def test_signals_on_another_device_are_learned_from(monkeypatch, second_device):
     buffer.update_tensordict_priority(batch.to(DEVICE))
     priorities = [part.sampler.priorities() for part in (buffer, expected)]
     torch.testing.assert_close(*priorities, rtol=1e-12, atol=0.0)
+
+
+def test_a_tree_rejects_slots_outside_of_it_and_takes_leaves_of_any_precision(monkeypatch):
+    take("compiled", monkeypatch)
+    tree = SumTree(3)
+    for slots in ([0, 3], [-1, 0]):
+        with pytest.raises(IndexError, match=r"slots must be in \[0, 3\)"):
+            tree[torch.tensor(slots)] = torch.ones(2)
+    assert tree.query(0, 3) == 0.0
+    tree[torch.tensor([0, 2])] = torch.tensor([1.5, 2.0])
+    assert [float(leaf) for leaf in tree[torch.arange(3)]] == [1.5, 0.0, 2.0]
+    assert tree.query(0, 3) == 3.5
 
 
 def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(monkeypatch):
