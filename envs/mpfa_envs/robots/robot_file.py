@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+import yaml
 
 from mpfa_envs.checks import MEANT
+from mpfa_envs.robots.controllers import Numbers, fill_in, read_controllers
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.worlds.yaml_nodes import NodeReader
-
-if TYPE_CHECKING:
-    import yaml
 
 _ELSEWHERE: Final = {
     "wheel_separation": "wheel_base",
@@ -42,6 +42,9 @@ class RobotFileError(ValueError):
 def load_robot(path: str | os.PathLike[str]) -> RobotModel:
     """Read a robot from a YAML file, whose keys are the fields of :class:`~mpfa_envs.RobotModel`.
 
+    The key ``controller``, a path from the file's folder or a list of paths, names parameter files
+    of ``diff_drive_controller`` and Nav2. Their numbers fill the fields that the file leaves out.
+
     Args:
         path: The file.
 
@@ -70,15 +73,32 @@ class _Reader(NodeReader):
 
     def robot(self, root: yaml.Node | None) -> RobotModel:
         """Read the whole file."""
-        entries = self.mapping(root, "the file", tuple(field.name for field in fields(RobotModel)))
+        names = *(field.name for field in fields(RobotModel)), "controller"
+        entries = self.mapping(root, "the file", names)
+        controller = entries.pop("controller", None)
         values = {"name": self.path.stem}
         values |= {key: self._value(key, node) for key, node in entries.items()}
+        if numbers := self._controllers(controller):
+            fill_in(values, numbers)
         try:
             return RobotModel.from_fields(values)
         except ValueError as error:
             # Errors of a model begin with the name of a field.
-            node = entries.get(str(error).partition(" ")[0], root)
-            raise self.error(node, str(error)) from error
+            field = str(error).partition(" ")[0]
+            node = entries.get(field, controller if controller and field in names else root)
+            where = f"{numbers[field][1]}: " if node is controller and field in numbers else ""
+            raise self.error(node, f"{where}{error}") from error
+
+    def _controllers(self, node: yaml.Node | None) -> Numbers:
+        """Read the files of the controller, if any; their paths begin at the folder of this one."""
+        if node is None:
+            return {}
+        paths = self.items(node, "controller") if isinstance(node, yaml.SequenceNode) else [node]
+        names = [self.text(path, "controller") for path in paths]
+        try:
+            return read_controllers([_Reader(self.path.parent / name) for name in names])
+        except RobotFileError as error:
+            raise self.error(node, f"controller: {error}") from error
 
     def _value(self, key: str, node: yaml.Node) -> Any:
         """Read the value of a key."""
