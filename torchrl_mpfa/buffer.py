@@ -18,8 +18,9 @@ from torchrl.data.replay_buffers import PrioritizedSampler, Sampler
 from torchrl.envs.transforms import Transform
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_generator
+from torchrl_mpfa.samplers.composition import distributions
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.samplers.prioritized import TreeSampler
+from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
@@ -66,9 +67,10 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     Raises:
         TypeError: If ``generator`` is no generator.
-        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` is not None or 0, or
-            the capacities of sampler and storage differ; or, where signals are fused, if
-            ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
+        ValueError: If ``batch_size`` is not a positive integer, the capacities of sampler and
+            storage differ, or ``prefetch`` is given with a sampler that follows updates or writes;
+            or, where signals are fused, if ``priority_key`` is where one is read, or
+            ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -108,11 +110,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self._unreturned, self._warned = 0, False
         if batch_size is not None:
             batch_size = check_counts(batch_size=batch_size)
-        if (prefetch := kwargs.get("prefetch")) not in (None, 0):
-            raise ValueError(
-                f"prefetch must be None, got {prefetch!r}: a batch that is sampled ahead knows "
-                "nothing of the priorities of the update before"
-            )
         if not isinstance(generator, torch.Generator | None):
             raise TypeError(f"generator must be a torch.Generator, got {generator!r}")
         # TorchRL sets it once the parts are made, which have to agree with it.
@@ -130,6 +127,12 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     def _initialize_prioritized_sampler(self) -> None:
         # Here an error leaves the buffer uninitialized, also where delayed_init put the parts off.
+        if self._prefetch and isinstance(self._sampler, PrioritizedSampler | SavedSampler):
+            raise ValueError(
+                f"prefetch must be None with {type(self._sampler).__name__}, got "
+                f"{self._prefetch_cap}: a batch that is sampled ahead knows nothing of the update "
+                "and the write before"
+            )
         if self._fuses:
             self._check_fusing_parts()
         super()._initialize_prioritized_sampler()
@@ -301,14 +304,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         ``"weight"``, the importance weight of Eq. (10) that the transition would have in a batch
         (NaN where it cannot be sampled); nothing without priorities.
         """
-        sampler, size = self.sampler, len(self)
-        if not isinstance(sampler, TreeSampler) or not size:
-            return {}
-        columns = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
-        table = getattr(sampler, "table", None)
-        if table is not None:
-            columns |= {name: table.rows[:size, column] for name, column in table.column.items()}
-        return columns
+        return distributions(self.sampler, len(self))
 
     def stats(self) -> dict[str, Any]:
         """Return TorchRL's counters, and the sampler's statistics of signals and batch."""
@@ -322,8 +318,9 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         """Return the state of all parts as in TorchRL.
 
         As in TorchRL the data are not copied: save or copy the state before more is written, after
-        which the state is rejected.
+        which the state is rejected. Batches that were sampled ahead are forgotten.
         """
+        self._forget_ahead()
         with self._replay_lock:
             # The data are not copied: the clock shows that they are no longer those of the state.
             return {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
@@ -374,6 +371,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             generator = torch.Generator(device=device)
             generator.set_state(numbers)
         sampler = self.sampler  # With delayed_init the parts are made here.
+        self._forget_ahead()
         with self._replay_lock, self._write_lock:
             before = deepcopy(self._transform.state_dict()), self._memory.copies()
             try:
@@ -420,6 +418,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         Raises:
             ValueError: If the data hold anything but tensors and plain values.
         """
+        self._forget_ahead()
         with new_dump(path) as folder, self._replay_lock:
             for name in _FOLDERS:
                 getattr(self, name).dumps(folder / name)

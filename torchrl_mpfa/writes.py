@@ -299,9 +299,15 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         Args:
             empty_write_count: As in TorchRL.
         """
+        self._forget_ahead()
         with self._replay_lock, self._write_lock:
             super().empty(empty_write_count)
         self._memory.empty()
+
+    def _forget_ahead(self) -> None:
+        """Forget batches that were sampled ahead: a copy of the buffer has none of them."""
+        with self._futures_lock:
+            self._clear_prefetch_queue_locked()
 
 
 def _is_plain(stored: Any) -> bool:

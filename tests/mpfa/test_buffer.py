@@ -229,6 +229,37 @@ def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage
             assert float(buffer.sampler._sum_tree[slot]) == pytest.approx((td_error + 0.05) ** 0.6)
 
 
+@pytest.mark.parametrize("forget", ["empty", "load", "loads", "save", "dumps"])
+def test_batches_of_a_uniform_sampler_are_sampled_ahead_and_forgotten_with_the_buffer(
+    forget, tmp_path
+):
+    def make(first):
+        parts = {"storage": SignalTensorStorage(16), "sampler": RandomSampler()}
+        buffer = SignalReplayBuffer(**parts, batch_size=8, prefetch=3)
+        buffer.extend(make_transitions(16, first=first))
+        return buffer
+
+    buffer, other = make(0), make(100)
+    assert buffer.sample()["observation"].max() < 16
+    assert buffer.stats()["prefetch_queue_size"] == 3
+    if forget == "load":
+        buffer.load_state_dict(other.state_dict())
+    elif forget == "loads":
+        other.dumps(tmp_path / "buffer")
+        buffer.loads(tmp_path / "buffer")
+    elif forget == "empty":
+        buffer.empty()
+        buffer.extend(make_transitions(16, first=100))
+    else:
+        # What was saved continues as what goes on.
+        saved = buffer.state_dict() if forget == "save" else buffer.dumps(tmp_path / "buffer")
+        twin = make(100)
+        twin.load_state_dict(saved) if saved else twin.loads(tmp_path / "buffer")
+        assert buffer.sample()["index"].equal(twin.sample()["index"])
+        return
+    assert all(buffer.sample()["observation"].min() >= 100 for _ in range(5))
+
+
 @pytest.mark.filterwarnings("ignore:Calling update_priority:UserWarning")
 @pytest.mark.parametrize(
     ("make_sampler", "key"),

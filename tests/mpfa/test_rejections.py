@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Sequence, Transition
+from torchrl.data import PrioritizedSampler, Sequence, Transition
 
 from tests.mpfa.transitions import (
     make_buffer,
@@ -15,6 +15,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import MPFASampler, Signal, SignalReplayBuffer, SignalSampler, SignalTensorStorage
+from torchrl_mpfa.samplers.uniform import CERSampler
 
 
 @pytest.fixture
@@ -115,7 +116,11 @@ def test_an_empty_buffer_cannot_be_sampled_or_updated():
 
 NOVELTY = ["td_error", Signal("novelty", key="novelty", known_at="write")]
 PARTS = [
-    *(({"prefetch": count}, f"prefetch must be None, got {count}") for count in (-1, 1, True)),
+    *(
+        ({"prefetch": count, "sampler": sampler}, f"prefetch must be None with .*, got {count}")
+        for count in (1, 3)
+        for sampler in (MPFASampler(8), PrioritizedSampler(8, 0.6, 0.4), CERSampler())
+    ),
     *(
         (
             {

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost
+from torchrl_mpfa.samplers.prioritized import TreeSampler
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.fused import SignalSampler
@@ -54,3 +55,14 @@ def composition(
         "sampled_age_max": float(age.max()),
         "replay_count_mean": float(rows[:, table.count_column].mean()),
     }
+
+
+def distributions(sampler: Any, size: int) -> dict[str, Tensor]:
+    """Return signals, priorities and weights of the first slots by name, each of shape ``[N]``."""
+    if not isinstance(sampler, TreeSampler) or not size:
+        return {}
+    columns = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
+    table = getattr(sampler, "table", None)
+    if table is not None:
+        columns |= {name: table.rows[:size, column] for name, column in table.column.items()}
+    return columns
