@@ -226,7 +226,7 @@ def write_signals(
     The TD error is the largest of the critics, as TorchRL writes it. The slope is that of the first
     critic in its evaluation mode, of quantiles that of their mean. The slope takes a forward and a
     backward pass of its own: call this before the step of the optimizer, by which the critic would
-    be another one.
+    be another one. Where the loss is compiled, call this outside of what is compiled.
 
     Args:
         batch: Transitions, batch size ``[B]``, that ``loss(batch)`` was called with; gets
@@ -258,6 +258,7 @@ def write_signals(
         >>> sorted(batch["signals"].keys())
         ['action_gradient', 'td_error']
     """
+    loss = getattr(loss, "_orig_mod", loss)  # Of a compiled one.
     if not isinstance(loss, SUPPORTED):
         raise TypeError(
             f"loss must be one of TorchRL's with a critic of actions, such as DDPGLoss, got "

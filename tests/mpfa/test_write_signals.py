@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch._dynamo.testing import CompileCounterWithBackend
 from torchrl.modules import QValueActor
 from torchrl.objectives import ClipPPOLoss, DDPGLoss, DQNLoss, TD3Loss
 
@@ -67,6 +68,31 @@ def test_writing_signals_leaves_gradients_and_graph_as_they_were():
     found = [p.grad for p in loss.parameters() if p.grad is not None]
     assert all(map(torch.equal, expected, found))
     assert not written["signals", "action_gradient"].requires_grad
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")
+@pytest.mark.parametrize("kind", KINDS)
+def test_signals_outside_of_a_compiled_loss_leave_it_one_graph(kind):
+    loss = make_torchrls(kind, make_apart(kind))
+    loss(make_batch(16))
+    torch.compiler.reset()
+    counter = CompileCounterWithBackend("eager")
+    compiled = torch.compile(loss, backend=counter, fullgraph=True)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    for given in (loss, compiled, loss):
+        batch, plain = make_batch(16), make_batch(16)
+        torch.manual_seed(1)
+        loss(plain)
+        write_signals(plain, loss)
+        torch.manual_seed(1)
+        values = compiled(batch)
+        write_signals(batch, given)
+        sum(value for name, value in values.items() if name.startswith("loss")).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        torch.testing.assert_close(batch["signals"], plain["signals"])
+    assert counter.frame_count == 1
 
 
 def test_dqn_has_a_td_error_alone():
