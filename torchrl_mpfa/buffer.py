@@ -67,10 +67,9 @@ class SignalReplayBuffer(CheckedReplayBuffer):
 
     Raises:
         TypeError: If ``generator`` is no generator.
-        ValueError: If ``batch_size`` is not a positive integer, the capacities of sampler and
-            storage differ, or ``prefetch`` is given with a sampler that follows updates or writes;
-            or, where signals are fused, if ``priority_key`` is where one is read, or
-            ``sample_unit`` makes sequences.
+        ValueError: If ``batch_size`` is no positive integer, the capacities of sampler and storage
+            differ, or ``prefetch`` meets priorities; or, where signals are fused, if
+            ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -293,7 +292,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
     def rewards(self) -> Tensor:
         """Return the rewards of all transitions, shape ``[N]``."""
         if self._fuses:
-            rewards: Tensor = self._sampler.table.rewards
+            with self._replay_lock, self._write_lock:
+                rewards: Tensor = self._sampler.table.rewards
             return rewards
         return self[:][REWARD_KEY].reshape(len(self)).double()
 
@@ -304,11 +304,12 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         ``"weight"``, the importance weight of Eq. (10) that the transition would have in a batch
         (NaN where it cannot be sampled); nothing without priorities.
         """
-        return distributions(self.sampler, len(self))
+        with self._replay_lock, self._write_lock:
+            return distributions(self.sampler, len(self))
 
     def stats(self) -> dict[str, Any]:
         """Return TorchRL's counters, and the sampler's statistics of signals and batch."""
-        with self._replay_lock:
+        with self._replay_lock, self._write_lock:
             numbers: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
                 numbers |= {"compiled": self._sampler.compiled, **self._sampler.stats()}
@@ -320,8 +321,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         As in TorchRL the data are not copied: save or copy the state before more is written, after
         which the state is rejected. Batches that were sampled ahead are forgotten.
         """
-        self._forget_ahead()
-        with self._replay_lock:
+        self._settle()
+        with self._replay_lock, self._write_lock:
             # The data are not copied: the clock shows that they are no longer those of the state.
             return {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
 
@@ -338,6 +339,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 the part is the storage the buffer is empty.
         """
         check_saved("buffer", state_dict, ("_storage", "_sampler", "_writer"))
+        self._settle()
         kind = state_dict["_sampler"].get("_kind")
         if kind is not None and not hasattr(self.sampler, "KIND"):
             # TorchRL's own would leave out what it does not know.
@@ -371,7 +373,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             generator = torch.Generator(device=device)
             generator.set_state(numbers)
         sampler = self.sampler  # With delayed_init the parts are made here.
-        self._forget_ahead()
+        self._settle()
         with self._replay_lock, self._write_lock:
             before = deepcopy(self._transform.state_dict()), self._memory.copies()
             try:
@@ -418,8 +420,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         Raises:
             ValueError: If the data hold anything but tensors and plain values.
         """
-        self._forget_ahead()
-        with new_dump(path) as folder, self._replay_lock:
+        self._settle()
+        with new_dump(path) as folder, self._replay_lock, self._write_lock:
             for name in _FOLDERS:
                 getattr(self, name).dumps(folder / name)
             source = self._rng

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from multiprocessing.context import get_spawning_popen
+from typing import Any, NoReturn, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,6 +16,8 @@ from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 from torchrl_mpfa.checks import check_not_negative
 from torchrl_mpfa.samplers.compiled import write_compiled
 from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.states import SavedSampler
+from torchrl_mpfa.sharing import SharedWrites, WriterSampler, check_shared
 from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
@@ -37,14 +40,33 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         super()._initialize_prioritized_sampler()
         self._memory = TransformMemory(self._transform, self._allow_nonfinite)
 
+    def share(self, shared: bool = True) -> Self:
+        """Let other processes write, or no longer; signals and priorities stay in this one."""
+        before = getattr(self, "_write_lock", None)
+        super().share(shared)
+        if isinstance(before, SharedWrites):
+            with before:  # Reads what was written so far.
+                pass
+        if shared:
+            self._write_lock = before if isinstance(before, SharedWrites) else SharedWrites(self)
+        return self
+
     def __getstate__(self) -> Any:
-        # The copy describes its own data.
-        return {**super().__getstate__(), "_schema": None}
+        if get_spawning_popen() is None:
+            # The copy describes its own data.
+            return {**super().__getstate__(), "_schema": None}
+        # The property, not the attribute: with delayed_init the parts are made at their first use.
+        keeps = isinstance(self.sampler, SavedSampler)
+        if keeps:
+            check_shared(self)
+        # A copy of the generator's state would be gone before the process reads it.
+        state = {**super().__getstate__(), "_schema": None, "_rng": None}
+        return {**state, "_sampler": WriterSampler()} if keeps else state
 
     def _checks(self, data: Any) -> bool:
         # The property, not the attribute: with delayed_init the parts are made at their first use.
         sampler = self.sampler
-        has_signals = isinstance(sampler, SignalSampler) or isinstance(
+        has_signals = isinstance(sampler, SignalSampler | WriterSampler) or isinstance(
             self._storage, SignalTensorStorage
         )
         consumes = isinstance(sampler, ConsumingSampler)
@@ -273,6 +295,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
 
     def __setitem__(self, index: Any, value: Any) -> None:
         """Write whole transitions in slots, and none of their entries by its key."""
+        self._check_owned()
         if isinstance(index, str | tuple):
             self._write_in_place()
         if self._checks(value):
@@ -299,15 +322,23 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         Args:
             empty_write_count: As in TorchRL.
         """
-        self._forget_ahead()
+        self._check_owned()
+        self._settle()
         with self._replay_lock, self._write_lock:
             super().empty(empty_write_count)
         self._memory.empty()
 
-    def _forget_ahead(self) -> None:
-        """Forget batches that were sampled ahead: a copy of the buffer has none of them."""
+    def _check_owned(self) -> None:
+        """Reject in another process what would pass the sampler of this one by."""
+        if isinstance(self.sampler, WriterSampler):
+            self.sampler.reject()
+
+    def _settle(self) -> None:
+        """Forget batches that were sampled ahead, and read what other processes wrote."""
         with self._futures_lock:
             self._clear_prefetch_queue_locked()
+        with self._write_lock:
+            pass
 
 
 def _is_plain(stored: Any) -> bool:

@@ -74,6 +74,11 @@ class SignalTensorStorage(LazyTensorStorage):
         """Hold a table of signals beside the data."""
         self.signal_table = table
 
+    def __getstate__(self) -> Any:
+        # Another process writes transitions alone.
+        mine = get_spawning_popen() is None
+        return {**super().__getstate__(), **({} if mine else {"signal_table": None})}
+
     def _takes(self, slots: Any) -> bool:
         """Return True if compiled loops may read and write a batch of slots."""
         return (
