@@ -31,7 +31,7 @@ from mpfa_envs import (
     render,
 )
 from torchrl_mpfa.methods import METHODS
-from training.plugins import SIGNALS
+from torchrl_mpfa.methods.registered import SIGNALS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
