@@ -35,7 +35,16 @@ from tensordict import TensorDict
 import mpfa_envs
 import torchrl_mpfa
 from mpfa_envs import POLICIES, evaluate, load_policy, make_navigation_env, summarize
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import (
+    ActorCritic,
+    MPFASampler,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    methods,
+    run_updates,
+)
 
 installed, version = Path(sys.argv[1]).resolve(), sys.argv[2]
 for package in (torchrl_mpfa, mpfa_envs):
@@ -63,6 +72,17 @@ batch["signals"] = TensorDict(
 )
 buffer.update_tensordict_priority(batch)
 print("weights of the signals:", buffer.sampler.weights, "compiled:", buffer.sampler.compiled)
+
+# A plugin: a signal and a method by name.
+methods.register_signal("ones", lambda learner, batch: torch.ones(len(batch)))
+methods.METHODS["mine"] = methods.Scaled("mine", signals=["td_error", "ones"])
+replay = methods.make_replay("mine", capacity=100, batch_size=4)
+replay.buffer.extend(rollout)
+learner = ActorCritic(make_actor(24, 2), make_critic(24, 2), **methods.loss_options("mine"))
+own = methods.OwnSignals(replay.signals)
+run_updates(replay.buffer, learner, updates=2, prepare=own.before(learner))
+assert replay.buffer.stats()["share/ones"] > 0
+print("a signal of a plugin:", replay.buffer.sampler.weights)
 
 shipped = {name: load_policy(name) for name in POLICIES}
 print("shipped policies:", ", ".join(shipped))

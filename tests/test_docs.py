@@ -31,7 +31,7 @@ from mpfa_envs import (
     render,
 )
 from torchrl_mpfa.methods import METHODS
-from training.plugins import SIGNALS
+from torchrl_mpfa.methods.registered import SIGNALS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -225,6 +225,26 @@ def test_the_code_of_a_page_runs_in_its_order(page: str) -> None:
     if page in HOWTO and "buffer" in names:
         # The last buffer of a page was learned from.
         assert names["buffer"].sampler.weights
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_arrays_on_the_page_on_offline_data_are_stored_and_change_the_priorities() -> None:
+    names = run("howto/offline.md", {})
+    stored, data = names["buffer"][:], names["data"]
+    for key, array in (
+        ("observation", "observations"),
+        ("action", "actions"),
+        (("next", "observation"), "next_observations"),
+        (("next", "reward"), "rewards"),
+        (("next", "terminated"), "terminals"),
+        (("next", "truncated"), "timeouts"),
+    ):
+        np.testing.assert_array_equal(stored[key].squeeze(-1), data[array])
+    ended = data["terminals"] | data["timeouts"]
+    np.testing.assert_array_equal(stored["next", "done"].squeeze(-1), ended)
+    columns = names["buffer"].distributions()
+    assert columns["td_error"].isfinite().sum() > names["UPDATES"]
+    assert len(columns["priority"].unique()) > names["UPDATES"]
 
 
 @pytest.mark.filterwarnings("ignore")

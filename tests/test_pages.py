@@ -19,6 +19,7 @@ COMMAND = re.compile(r"^    (?:\.venv/bin/)?(python [^#\n]*)", re.MULTILINE)
 SHORT = (
     (r"\bactions=(\d+)000", lambda found: f"actions={50 * int(found[1])} evaluation.every=500"),
     (r"--trials \d+", "--trials 1"),
+    (r"(sb3_replay.* --actions) \d+", r"\1 300"),
     (r"0 1 2", "0 1"),
 )
 

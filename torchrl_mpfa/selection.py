@@ -6,10 +6,11 @@ several batches, or gives critic and actor one each, is another callable of the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol, get_args, runtime_checkable
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
@@ -62,6 +63,13 @@ class SampledBatch:
             return [self]
         rows = self.batch.split(len(self.batch) // self.batches)
         return [replace(self, batch=part, batches=1) for part in rows]
+
+    def each(self, change: Callable[[TensorDictBase], None]) -> SampledBatch:
+        """Change each batch by itself, in their order; return all of them."""
+        parts = [part.batch for part in self.parts()]
+        for batch in parts:
+            change(batch)
+        return replace(self, batch=torch.cat(parts))
 
 
 def as_sampled(sampled: SampledBatch | TensorDictBase) -> SampledBatch:

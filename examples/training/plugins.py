@@ -1,4 +1,4 @@
-"""Plugins: a file of one's own that is imported first, and the signals that it registers."""
+"""Plugins: a file of one's own that is imported first, and registers names."""
 
 from __future__ import annotations
 
@@ -6,52 +6,15 @@ import os
 import sys
 import traceback
 from argparse import ArgumentParser, ArgumentTypeError
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+# Plugins of 0.4 import it from here.
+from torchrl_mpfa.methods import register_signal as register_signal
 from training.files import digest
 
-if TYPE_CHECKING:
-    from tensordict import TensorDictBase
-    from torch import Tensor
-
-SignalFunction = Callable[..., Any]
-"""From a learner and a batch to a signal, shape ``[B]``."""
-OF_LOSSES = (
-    *("reward", "td_error", "action_gradient", "value"),
-    *("relative_value", "relative_td_error", "information_gain"),
-)
-"""Signals that the losses of ``train.py`` write."""
-SIGNALS: dict[str, SignalFunction | type[SignalFunction]] = {}
-"""Signals of plugins by name; :func:`register_signal` adds one."""
 _WORD = "plugin="
-
-
-def register_signal(name: str, signal: SignalFunction | type[SignalFunction]) -> None:
-    """Add a signal, for this process.
-
-    Args:
-        name: Its name, in the ``signals`` of a method.
-        signal: Function from a learner and a batch of ``[B]`` transitions to non-negative numbers,
-            shape ``[B]``; or a class of such objects, of which each run makes one. What its
-            ``state_dict()`` gives, if it has one, is saved with the run.
-
-    Raises:
-        TypeError: If the signal cannot be called.
-        ValueError: If a loss has a signal of this name.
-
-    Examples:
-        >>> def size(learner, batch):
-        ...     return batch["action"].square().sum(-1)
-        >>> register_signal("size", size)  # doctest: +SKIP
-    """
-    if not callable(signal):
-        raise TypeError(f"signal must be a function or a class, got {signal!r}")
-    if not name or name in OF_LOSSES:
-        raise ValueError(f"name must be one that no loss has, got {name!r}")
-    SIGNALS[name] = signal
 
 
 def load_plugin(path: str | Path) -> str:
@@ -152,45 +115,3 @@ def with_plugin(
         raise ValueError(f"plugin must be one file, got {' and '.join(sorted(paths))}")
     path = paths.pop()
     return [*(word for word in words if not word.startswith(_WORD)), f"{_WORD}{path}"], path
-
-
-class OwnSignals:
-    """Those signals of a run that its plugin registered.
-
-    Args:
-        names: Learned signals of the method.
-    """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._functions: dict[str, SignalFunction] = {}
-        for name in names:
-            if name in SIGNALS:
-                signal = SIGNALS[name]
-                self._functions[name] = signal() if isinstance(signal, type) else signal
-
-    def __len__(self) -> int:
-        return len(self._functions)
-
-    def write(self, learner: Any, batch: TensorDictBase) -> None:
-        """Write the signals in a batch, before the learner learns from it."""
-        for name, function in self._functions.items():
-            value: Tensor = function(learner, batch)
-            if value.shape != batch.shape[:1]:
-                raise ValueError(
-                    f"signal {name!r} must have shape {[*batch.shape[:1]]}, got {[*value.shape]}"
-                )
-            batch["signals", name] = value.detach()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of those that have one."""
-        states = {name: each for name, each in self._functions.items() if _has_state(each)}
-        return {name: each.state_dict() for name, each in states.items()}  # type: ignore[attr-defined]
-
-    def load_state_dict(self, states: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        for name, state in states.items():
-            self._functions[name].load_state_dict(state)  # type: ignore[attr-defined]
-
-
-def _has_state(function: SignalFunction) -> bool:
-    return hasattr(function, "state_dict") and hasattr(function, "load_state_dict")

@@ -19,6 +19,7 @@ import export
 import play
 import recurrent_td3
 import report
+import sb3_replay
 import stable_baselines
 import torchrl_ddpg
 import torchrl_maddpg
@@ -54,6 +55,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "play": play.main,
     "recurrent_td3": recurrent_td3.main,
     "report": report.main,
+    "sb3_replay": sb3_replay.main,
     "stable_baselines": stable_baselines.main,
     "torchrl_ddpg": torchrl_ddpg.main,
     "torchrl_maddpg": torchrl_maddpg.main,

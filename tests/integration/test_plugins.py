@@ -20,10 +20,10 @@ from mpfa_envs.generators import generate
 from tests.integration.tiny_runs import OVERRIDES, rows, stop_after, tiny
 from tests.integration.tiny_runs import go_on as train_on
 from tests.integration.tiny_runs import train as train_tiny
-from torchrl_mpfa.methods import METHODS
-from training import files, plugins
+from torchrl_mpfa.methods import METHODS, SIGNALS, OwnSignals, register_signal
+from training import files
 from training.comparison.jobs import Evaluation, Job
-from training.plugins import load_plugin, register_signal, with_plugin
+from training.plugins import load_plugin, with_plugin
 from training.run.checkpoints import read_checkpoint
 from training.settings.checks import check_settings
 from training.settings.command_line import composed, known_settings
@@ -32,8 +32,7 @@ from training.settings.train import register
 MINE = """
 from torch import nn
 from mpfa_envs import ROBOTS, Cylinder, World, register_generator
-from torchrl_mpfa.methods import METHODS, Scaled
-from training.plugins import register_signal
+from torchrl_mpfa.methods import METHODS, Scaled, register_signal
 
 class Size(nn.Module):
     def __init__(self):
@@ -58,7 +57,7 @@ def mine(tmp_path: Path) -> Iterator[Path]:
     """A plugin, of which nothing stays."""
     file = tmp_path / "mine_of_a_test.py"
     file.write_text(MINE)
-    known = METHODS, ROBOTS, plugins.SIGNALS, generate._registered
+    known = METHODS, ROBOTS, SIGNALS, generate._registered
     before = [dict(each) for each in known]
     yield file
     for each, names in zip(known, before, strict=True):
@@ -189,7 +188,7 @@ def test_what_is_no_plugin_is_one_line(
 
 def test_a_signal_of_another_shape_is_rejected_by_name(mine: Path) -> None:
     register_signal("half", lambda learner, batch: batch["x"][:4])
-    own = plugins.OwnSignals(["half", "td_error"])
+    own = OwnSignals(["half", "td_error"])
     with pytest.raises(ValueError, match=r"signal 'half' must have shape \[8\], got \[4\]"):
         own.write(None, TensorDict({"x": torch.zeros(8)}, [8]))
     with pytest.raises(TypeError, match="signal must be a function or a class, got 3"):

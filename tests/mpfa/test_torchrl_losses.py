@@ -14,7 +14,7 @@ import torchrl.objectives as objectives
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.data import Bounded, OneHot
+from torchrl.data import Bounded, LazyTensorStorage, OneHot, TensorDictReplayBuffer
 from torchrl.modules import (
     DistributionalQValueActor,
     OneHotCategorical,
@@ -24,6 +24,7 @@ from torchrl.modules import (
     ValueOperator,
 )
 from torchrl.objectives import LossModule
+from torchrl.trainers import ReplayBufferTrainer
 
 import torchrl_mpfa as mpfa
 
@@ -282,3 +283,70 @@ def test_page_has_a_row_for_each_loss_with_a_critic() -> None:
     assert {name for name in there if not name.startswith("Dreamer")} == known
     assert documented().keys() == {f"{name}Loss" for name in off_policy}
     assert documented().keys() == LOSSES.keys()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", LOSSES)
+def test_equal_weights_change_no_loss_as_the_page_says(name: str) -> None:
+    """TorchRL divides by the sum of the weights, Eq. (11) by the number of transitions."""
+    values = []
+    for weight in (1.0, 0.5):
+        torch.manual_seed(0)
+        loss = LOSSES[name]()
+        if name != "DistributionalDQNLoss":
+            loss.make_value_estimator(gamma=0.99)
+        torch.manual_seed(1)
+        values.append(loss(last_steps(name, torch.full((ROWS,), weight))))
+    losses = sorted(key for key in values[0].keys() if key.startswith("loss"))  # noqa: SIM118
+    assert losses
+    for key in losses:
+        torch.testing.assert_close(values[0][key], values[1][key])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [("TD3Loss", "value_loss"), ("TD3BCLoss", "qvalue_loss"), ("CrossQLoss", "qvalue_loss")],
+)
+def test_td_error_that_a_part_returns_is_written_as_the_page_says(name: str, part: str) -> None:
+    whole, parted = (last_steps(name, torch.ones(ROWS)) for _ in range(2))
+    loss = called(name, whole)
+    mpfa.write_signals(whole, loss)
+    _, extra = getattr(loss, part)(parted)
+    error = extra["td_error"].detach()
+    parted["td_error"] = error if name == "CrossQLoss" else error.amax(0)
+    mpfa.write_signals(parted, loss)
+    for signal in ("td_error", "action_gradient"):
+        assert whole["signals", signal].allclose(parted["signals", signal], rtol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "signals"),
+    [
+        *((name, None) for name in ("DDPGLoss", "TD3Loss", "TD3BCLoss", "SACLoss", "REDQLoss")),
+        *((name, None) for name in ("CrossQLoss", "IQLLoss", "CQLLoss")),
+        *((name, ["reward", "td_error"]) for name in ("DiscreteSACLoss", "DQNLoss")),
+    ],
+)
+def test_buffer_of_a_script_changes_to_ours_as_the_page_says(
+    name: str, signals: list[str] | None
+) -> None:
+    """The batch of a trainer, as in redq, and that of a loop; rows as those of a data set."""
+    theirs = TensorDictReplayBuffer(storage=LazyTensorStorage(ROWS), batch_size=ROWS)
+    theirs.extend(last_steps(name, torch.ones(ROWS)).exclude("priority_weight"))
+    options = {} if signals is None else {"signals": signals}
+    buffer = mpfa.SignalReplayBuffer(
+        storage=LazyTensorStorage(ROWS), sampler=mpfa.MPFASampler(**options), batch_size=ROWS
+    )
+    buffer.extend(theirs[:])
+    hook = ReplayBufferTrainer(buffer, ROWS)
+    batch = hook.sample(buffer[:])
+    loss = called(name, batch)
+    mpfa.write_signals(batch, loss)
+    before = buffer.distributions()["priority"].clone()
+    hook.update_priority(batch)
+    assert not before.equal(buffer.distributions()["priority"])
+    # Their own line of the loop lacks the priority.
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'priority'"):
+        theirs.update_priority(batch)

@@ -16,11 +16,15 @@ if TYPE_CHECKING:
     from torchrl_mpfa.methods.catalogue import Adjusted as Adjusted
     from torchrl_mpfa.methods.catalogue import Scaled as Scaled
     from torchrl_mpfa.methods.catalogue import method_named as method_named
+    from torchrl_mpfa.methods.registered import SIGNALS as SIGNALS
+    from torchrl_mpfa.methods.registered import OwnSignals as OwnSignals
+    from torchrl_mpfa.methods.registered import register_signal as register_signal
 
 _NAMES = {
     "assembly": "Replay loss_options make_replay",
     "base": "Method Prioritized",
     "catalogue": "ALIASES METHODS MPFA Adjusted Scaled method_named",
+    "registered": "SIGNALS OwnSignals register_signal",
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))

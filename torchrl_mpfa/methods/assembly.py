@@ -14,6 +14,7 @@ from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.methods.base import Method
 from torchrl_mpfa.methods.catalogue import method_named
+from torchrl_mpfa.methods.registered import SIGNALS
 from torchrl_mpfa.selection import Selection
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
@@ -132,7 +133,8 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         method: A name, or a method of your own.
 
     Returns:
-        ``signals``, ``importance``, ``loss_function``, ``target_average`` and ``pal_alpha``.
+        ``signals`` without the registered ones, ``importance``, ``loss_function``,
+        ``target_average`` and ``pal_alpha``.
 
     Raises:
         ValueError: If the method is unknown.
@@ -143,7 +145,7 @@ def loss_options(method: str | Method) -> dict[str, Any]:
     """
     chosen = method_named(method)
     return {
-        "signals": learned_signals(chosen),
+        "signals": [name for name in learned_signals(chosen) if name not in SIGNALS],
         "importance": chosen.importance,
         "loss_function": chosen.loss_function,
         "target_average": chosen.target_average,

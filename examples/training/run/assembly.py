@@ -26,7 +26,6 @@ from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor
 from torchrl_mpfa.networks.deterministic import ValueNetwork
-from training.plugins import SIGNALS
 from training.run.driving import Robots
 from training.run.q_learning import TabularQLearner, ValueTable, make_value_table
 from training.settings.learners import LearnerSettings, is_discrete
@@ -77,7 +76,7 @@ def make_learner(
         actor.to(device),
         critic.to(device),
         **of_algorithm[algorithm],
-        **_options(method),
+        **loss_options(method),
         gamma=settings.gamma,
         reward_scale=settings.reward_scale,
         saturation_penalty=settings.saturation_penalty,
@@ -91,14 +90,8 @@ def make_learner(
     )
 
 
-def _options(method: Method) -> Options:
-    """Return the options of a loss; signals of a plugin are none that a loss writes."""
-    options = loss_options(method)
-    return options | {"signals": [name for name in options["signals"] if name not in SIGNALS]}
-
-
 def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
-    options = _options(method)
+    options = loss_options(method)
     return DQN(
         network,
         **{name: options[name] for name in ("signals", "importance", "loss_function")},

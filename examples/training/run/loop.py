@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -18,13 +19,13 @@ from tqdm import tqdm
 from mpfa_envs import GoalRelabeling
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import Stop, run_updates
+from torchrl_mpfa.methods import OwnSignals
 from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
 from training.evaluating import Drives
 from training.files import no_room
-from training.plugins import OwnSignals
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import showing
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
@@ -262,12 +263,13 @@ class TrainingRun:
             sampled = replace(sampled, batch=sampled.batch.to(device))
         if not sampled.gives_signals or (self.curiosity is None and not self.signals):
             return sampled
-        parts = [part.batch for part in sampled.parts()]
-        for batch in parts:
-            if self.curiosity is not None:
-                self._bonus = self.curiosity(batch)
-            self.signals.write(self.learner, batch)
-        return replace(sampled, batch=torch.cat(parts))
+        return sampled.each(self._extend)
+
+    def _extend(self, batch: TensorDictBase) -> None:
+        """Add the bonus and the signals of the run to a batch."""
+        if self.curiosity is not None:
+            self._bonus = self.curiosity(batch)
+        self.signals.write(self.learner, batch)
 
     def _evaluate(self) -> None:
         found, self.driven = evaluate_policy(

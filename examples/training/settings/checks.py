@@ -14,9 +14,9 @@ import torch
 from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
+from torchrl_mpfa.methods.registered import OF_LOSSES, SIGNALS
 from training.environments import FilteredRobots, make_training_env, task_arguments
 from training.evaluating import check_physics
-from training.plugins import OF_LOSSES, SIGNALS
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
 from training.settings.rules import check_rules, named, up_to
