@@ -124,7 +124,7 @@ def measure(name: str = "replay_1e5", *, capacity: int = 100_000, quick: bool) -
 def draw(path: Path) -> None:
     """Measure buffers of two sizes, and draw the times as bars."""
     sizes = {"100,000": 100_000, "1,000,000": 1_000_000}
-    figure, panels = new_figure(1, len(sizes), panel=(4.2, 2.2), sharey=True)
+    figure, panels = new_figure(1, len(sizes), panel=(3.5, 2.2), sharey=True)
     for axes, (title, capacity) in zip(panels, sizes.items(), strict=True):
         entries = measure("replay", capacity=capacity, quick=False)
         names = {"replay": "torchrl-mpfa, three signals", "replay_torchrl": "TorchRL"}
