@@ -56,7 +56,7 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
 
 
 @cache
-def library() -> Any:
+def find_loops() -> Any:
     """Return the compiled loops; None where there are none."""
     if os.environ.get("TORCHRL_MPFA_NATIVE") == "0":
         return None
@@ -86,7 +86,7 @@ def loops() -> Any:
     Raises:
         RuntimeError: If there are none.
     """
-    if (compiled := library()) is None:
+    if (compiled := find_loops()) is None:
         raise RuntimeError(
             "a sampler that was made with compiled loops needs them, and here are none: load its "
             "state_dict() into a new one"

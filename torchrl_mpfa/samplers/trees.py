@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Storage
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
-from torchrl_mpfa.native import library, loops
+from torchrl_mpfa.native import find_loops, loops
 from torchrl_mpfa.storages.schema import as_integers
 
 _ORDERED = 2048
@@ -64,7 +64,7 @@ class SumTree(CompiledTree):
     """A segment tree of sums.
 
     Examples:
-        >>> tree = SumTree(3) if library() else SumLeaves(3)
+        >>> tree = SumTree(3) if find_loops() else SumLeaves(3)
         >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
         >>> float(tree.query(0, 3))
         3.0
@@ -150,7 +150,7 @@ class MinLeaves(Leaves):
 
 def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor]:
     """Return empty trees of sums, of minima and of minima, and priorities, NaN, shape ``[N]``."""
-    if device.type == "cpu" and library() is not None:
+    if device.type == "cpu" and find_loops() is not None:
         width = 1 << capacity.bit_length()
         # Side by side: two children of a node are one line of the processor's cache.
         nodes = torch.full((2 * width, 4), torch.nan, dtype=torch.double)

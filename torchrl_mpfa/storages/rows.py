@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_mpfa.native import library
+from torchrl_mpfa.native import find_loops
 
 WIDTH = 4
 """Numbers of a column: addresses of what is stored and of the rows, bytes of a row, precision.
@@ -46,7 +46,7 @@ def _call(loop: str, columns: list[int], slots: Tensor, end: int) -> int:
     table = array("q", columns)
     slots = slots.contiguous()
     rows = table.buffer_info()[0], len(columns) // WIDTH
-    wrong: int = getattr(library(), loop)(*rows, slots.data_ptr(), len(slots), end)
+    wrong: int = getattr(find_loops(), loop)(*rows, slots.data_ptr(), len(slots), end)
     return wrong
 
 

@@ -21,7 +21,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import check_counts, generator_on
-from torchrl_mpfa.native import library
+from torchrl_mpfa.native import find_loops
 from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
 from torchrl_mpfa.storages.rows import rows_at, write_rows
 from torchrl_mpfa.storages.schema import Schema, as_index
@@ -90,7 +90,7 @@ class SignalTensorStorage(LazyTensorStorage):
             and 0 < len(slots) <= self.max_size
             and self.initialized
             and type(self._storage) is TensorDict
-            and library() is not None
+            and find_loops() is not None
         )
 
     def batch(self, slots: Any, more: Mapping[str, Tensor] | None = None) -> TensorDict | None:

@@ -8,5 +8,5 @@ PATHS = ("compiled", "pytorch")
 def take(path, monkeypatch):
     """Parts that are made from now on take this path."""
     monkeypatch.setenv("TORCHRL_MPFA_NATIVE", "1" if path == "compiled" else "0")
-    native.library.cache_clear()
-    assert (native.library() is None) == (path == "pytorch")
+    native.find_loops.cache_clear()
+    assert (native.find_loops() is None) == (path == "pytorch")

@@ -33,7 +33,7 @@ CAPACITY, BATCH = 37, 8
 def own_library():
     """The next test looks for the loops again."""
     yield
-    native.library.cache_clear()
+    native.find_loops.cache_clear()
 
 
 def per_signal(name):
@@ -263,8 +263,8 @@ def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    native.library.cache_clear()
-    assert native.library() is None
+    native.find_loops.cache_clear()
+    assert native.find_loops() is None
     buffer = make_buffer(16)
     buffer.extend(make_transitions(16))
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
@@ -274,15 +274,15 @@ def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
 def test_a_folder_of_caches_that_is_no_folder_leaves_it_to_pytorch(monkeypatch, tmp_path):
     (tmp_path / "torchrl_mpfa").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.library.cache_clear()
-    assert native.library() is None
+    native.find_loops.cache_clear()
+    assert native.find_loops() is None
 
 
 def test_others_cannot_write_to_the_folder_of_what_is_loaded(monkeypatch, tmp_path):
     (tmp_path / "torchrl_mpfa").mkdir(mode=0o777)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.library.cache_clear()
-    assert native.library() is not None
+    native.find_loops.cache_clear()
+    assert native.find_loops() is not None
     assert (tmp_path / "torchrl_mpfa").stat().st_mode & 0o777 == 0o700
 
 
@@ -294,18 +294,18 @@ def test_a_compiler_that_fails_leaves_no_file(monkeypatch, tmp_path):
 
 def test_a_damaged_library_is_compiled_again(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.library.cache_clear()
-    assert native.library() is not None
+    native.find_loops.cache_clear()
+    assert native.find_loops() is not None
     (made,) = (tmp_path / "torchrl_mpfa").iterdir()
     # Not in place: this process has it mapped.
     made.unlink()
     made.write_bytes(b"not a library")
-    native.library.cache_clear()
-    assert native.library() is not None
+    native.find_loops.cache_clear()
+    assert native.find_loops() is not None
 
 
 def test_a_first_use_in_two_processes_at_once_gives_both_the_loops(tmp_path):
-    program = "from torchrl_mpfa.native import library; assert library() is not None"
+    program = "from torchrl_mpfa.native import find_loops; assert find_loops() is not None"
     environment = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
     command = [sys.executable, "-c", program]
     runs = [subprocess.Popen(command, env=environment) for _ in range(2)]

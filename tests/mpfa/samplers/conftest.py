@@ -11,4 +11,4 @@ def path(request, monkeypatch):
     """What samplers and storages of a test take."""
     take(request.param, monkeypatch)
     yield request.param
-    native.library.cache_clear()
+    native.find_loops.cache_clear()
