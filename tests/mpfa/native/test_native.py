@@ -21,6 +21,7 @@ from torchrl_mpfa import (
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
+    SignalMemmapStorage,
     SignalReplayBuffer,
     SignalTensorStorage,
     native,
@@ -280,6 +281,18 @@ def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(mon
         found.append((buffer[:]["observation"], buffer.sampler.table.rows))
     assert torch.equal(found[0][0], found[1][0])
     torch.testing.assert_close(found[0][1], found[1][1], equal_nan=True, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_each_storage_of_this_package_is_written_by_compiled_loops(kind, monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16, storage=kind(16))
+    buffer.extend(make_transitions(4))  # Makes room for the form of the transitions.
+    monkeypatch.setattr(buffer, "_extend_checked", None)
+    rows = make_transitions(3, seed=1)
+    slots = buffer.extend(rows)
+    assert slots.tolist() == [4, 5, 6]
+    assert buffer[slots]["observation"].equal(rows["observation"])
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda part: pickle.loads(pickle.dumps(part))])
