@@ -19,7 +19,7 @@ from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.sharing import SharedWrites, WriterSampler, check_shared
 from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
-from torchrl_mpfa.storages.tensor import SignalTensorStorage, slots_of
+from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
 
 REWARD_KEY = ("next", "reward")
@@ -112,7 +112,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         """Write transitions by compiled loops; None where PyTorch has to, or finds fault."""
         storage, sampler, writer = self._storage, self._sampler, self._writer
         if (
-            type(storage) is not SignalTensorStorage
+            type(storage) not in (SignalTensorStorage, SignalMemmapStorage)
             or storage.ndim != 1
             or not storage.initialized
             or type(data) is not TensorDict

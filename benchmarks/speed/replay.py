@@ -67,10 +67,12 @@ def make_transitions(count: int, *, seed: int = 0) -> TensorDict:
     )
 
 
-def make_mpfa_buffer(capacity: int, batch_size: int = BATCH_SIZE) -> SignalReplayBuffer:
-    """A full buffer of this package with the paper's sampler."""
+def make_mpfa_buffer(
+    capacity: int, batch_size: int = BATCH_SIZE, storage: SignalTensorStorage | None = None
+) -> SignalReplayBuffer:
+    """A full buffer of this package with the paper's sampler; by default in memory."""
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(capacity),
+        storage=SignalTensorStorage(capacity) if storage is None else storage,
         sampler=MPFASampler(capacity, ALPHA, BETA),
         batch_size=batch_size,
         generator=torch.Generator().manual_seed(0),

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from benchmarks.speed import (
+    disk,
     leaves,
     method_steps,
     replay,
@@ -50,6 +51,18 @@ def test_replay_is_compared_with_that_of_torchrl(measure) -> None:
     assert ours["name"] == "small"
     assert ours["baseline"] == stock["name"] == "small_torchrl"
     assert stock["ratio"] is None
+
+
+def test_replay_on_disk_says_its_times_and_its_memory_and_leaves_no_file(tmp_path, capsys) -> None:
+    disk.main(["--rows", "2000", "--folder", str(tmp_path)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "2000 transitions, 262 bytes each in files"
+    assert [line.split(":")[0] for line in lines[1:4]] == [
+        "memory beside the files",
+        "sample and update",
+        "write one",
+    ]
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

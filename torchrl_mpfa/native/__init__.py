@@ -22,7 +22,7 @@ class Replay(Structure):
 
     _fields_ = [
         *((name, c_void_p) for name in ("nodes", "table")),
-        *((name, c_int64) for name in ("slots", "width", "columns")),
+        *((name, c_int64) for name in ("slots", "blocks", "columns")),
     ]
 
 

@@ -1,9 +1,10 @@
 // Loops of prioritized replay. A caller has checked types, devices and lengths.
 //
-// A tree over N slots is an array of 2 * width nodes: width is the smallest power of two above N, node
-// k has the children 2k and 2k + 1, and slot s is node width + s. Its numbers are `stride` apart, as
-// several trees may share an array. Sums and minima are made in the order of TorchRL's trees, so that
-// they are the same to the last bit.
+// A tree over N slots has its leaves in blocks. The smallest power of two of `blocks` that hold them are
+// the leaves of an array of 2 * blocks nodes, where node k has the children 2k and 2k + 1; the leaves of
+// the slots come after them. Levels within a block are not kept, but made from its leaves, which lie
+// side by side. Numbers of a tree are `stride` apart, as several trees may share an array. Sums and
+// minima are made in the order of TorchRL's trees, so that they are the same to the last bit.
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -17,6 +18,7 @@ typedef struct {
 } Column;
 
 enum {
+  BLOCK = 16,  // Also in trees.py.
   AHEAD = 8,  // Rows whose memory is asked for before they are needed.
   SIDE = 16   // Descents side by side, each of which waits for memory at every level.
 };
@@ -31,16 +33,31 @@ static int64_t outside(const int64_t *slots, int64_t n, int64_t end) {
 
 // Trees.
 
+// The sum or minimum of n leaves, a power of two of them up to a block.
+static inline double fold(const double *leaf, int64_t stride, int64_t n, int64_t minimum) {
+  double v[BLOCK];
+  for (int64_t i = 0; i < n; i++) v[i] = leaf[i * stride];
+  for (; n > 1; n >>= 1)
+    for (int64_t i = 0; i < n / 2; i++)
+      v[i] = minimum ? least(v[2 * i], v[2 * i + 1]) : v[2 * i] + v[2 * i + 1];
+  return v[0];
+}
+
 // Returns 1, and writes nothing, if a slot is not below `size`.
-int64_t set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, int64_t size,
+int64_t set_leaves(double *t, int64_t stride, int64_t blocks, int64_t minimum, int64_t size,
                    const int64_t *slots, const double *leaf, int64_t n) {
   if (outside(slots, n, size)) return 1;
-  for (int64_t i = 0; i < n; i++) t[(width | slots[i]) * stride] = leaf[i];
+  double *leaves = t + 2 * blocks * stride;
+  for (int64_t i = 0; i < n; i++) leaves[slots[i] * stride] = leaf[i];
+  for (int64_t i = 0; i < n; i++) {
+    int64_t b = slots[i] / BLOCK;
+    t[(blocks + b) * stride] = fold(leaves + b * BLOCK * stride, stride, BLOCK, minimum);
+  }
   // Level by level, so that no slot waits for another; of a narrow level all nodes.
-  for (int shift = 1; width >> shift; shift++) {
-    int64_t nodes = width >> shift, all = nodes < n;
+  for (int shift = 1; blocks >> shift; shift++) {
+    int64_t nodes = blocks >> shift, all = nodes < n;
     for (int64_t i = 0; i < (all ? nodes : n); i++) {
-      int64_t k = all ? nodes + i : (width | slots[i]) >> shift;
+      int64_t k = all ? nodes + i : (blocks | slots[i] / BLOCK) >> shift;
       double a = t[2 * k * stride], b = t[(2 * k + 1) * stride];
       t[k * stride] = minimum ? least(a, b) : a + b;
     }
@@ -48,27 +65,37 @@ int64_t set_leaves(double *t, int64_t stride, int64_t width, int64_t minimum, in
   return 0;
 }
 
-double query(const double *t, int64_t stride, int64_t width, int64_t minimum, int64_t size,
+// The sum or minimum at a node, with nodes of the levels within blocks counted on.
+static double at(const double *t, int64_t stride, int64_t blocks, int64_t minimum, int64_t k) {
+  if (k < 2 * blocks) return t[k * stride];
+  int64_t n = 1;
+  for (; k < BLOCK * blocks; k <<= 1) n <<= 1;
+  return fold(t + (k + 2 * blocks - BLOCK * blocks) * stride, stride, n, minimum);
+}
+
+double query(const double *t, int64_t stride, int64_t blocks, int64_t minimum, int64_t size,
              int64_t start, int64_t end) {
   if (start <= 0 && end >= size) return t[stride];
   double result = minimum ? 1.7976931348623157e308 : 0.0;
-  for (int64_t l = start | width, r = end | width; l < r; l >>= 1, r >>= 1) {
-    if (l & 1) { double v = t[l++ * stride]; result = minimum ? least(result, v) : result + v; }
-    if (r & 1) { double v = t[--r * stride]; result = minimum ? least(result, v) : result + v; }
-  }
+  for (int64_t l = BLOCK * blocks + start, r = BLOCK * blocks + end; l < r; l >>= 1, r >>= 1)
+    for (int side = 0; side < 2; side++)
+      if ((side ? r : l) & 1) {
+        double v = at(t, stride, blocks, minimum, side ? --r : l++);
+        result = minimum ? least(result, v) : result + v;
+      }
   return result;
 }
 
 // Slots at shares of the sum of the filled slots.
-void find(const double *t, int64_t stride, int64_t width, int64_t size, int64_t filled,
+void find(const double *t, int64_t stride, int64_t blocks, int64_t size, int64_t filled,
           const double *share, int64_t n, int64_t *slots) {
-  double total = query(t, stride, width, 0, size, 0, filled);
+  double total = query(t, stride, blocks, 0, size, 0, filled);
   for (int64_t i = 0; i < n; i += SIDE) {
     int m = n - i < SIDE ? (int)(n - i) : SIDE;
     int64_t k[SIDE];
     double v[SIDE];
     for (int j = 0; j < m; j++) { k[j] = 1; v[j] = share[i + j] * total; }
-    for (int64_t d = 1; d < width; d <<= 1)
+    for (int64_t d = 1; d < blocks; d <<= 1)
       for (int j = 0; j < m; j++) {
         int64_t q = k[j] << 1;
         double left = t[q * stride];
@@ -76,10 +103,20 @@ void find(const double *t, int64_t stride, int64_t width, int64_t size, int64_t 
         v[j] -= left * right;  // No branch, as it could not be predicted.
         k[j] = q | right;
       }
+    // Rounding can carry the last bit of mass past the last slot, and the last block.
     for (int j = 0; j < m; j++) {
-      // Rounding can carry the last bit of mass past the last slot.
-      int64_t s = k[j] ^ width;
-      slots[i + j] = s < filled ? s : filled - 1;
+      k[j] = (k[j] ^ blocks) * BLOCK;
+      for (int64_t l = 0; k[j] < size && l < BLOCK * stride; l += 8)
+        __builtin_prefetch(t + (2 * blocks + k[j]) * stride + l);
+    }
+    for (int j = 0; j < m; j++) {
+      for (int64_t half = BLOCK / 2, end = size - 1; half && k[j] <= end; half >>= 1) {
+        double left = fold(t + (2 * blocks + k[j]) * stride, stride, half, 0);
+        int right = v[j] > left;
+        v[j] -= left * right;
+        k[j] += right * half;
+      }
+      slots[i + j] = k[j] < filled ? k[j] : filled - 1;
     }
   }
 }
@@ -121,25 +158,35 @@ typedef struct {
   double sum, lowest;       // Of the leaves.
   double highest;           // Minus the highest priority that was learned.
   double priority;          // Of a slot; of no use in other nodes.
-} Node;                     // Two children are one line of a cache.
+} Node;                     // Two are one line of a cache.
 
 typedef struct {
   Node *nodes;
   double *table;                  // Rows of signals, [N, columns].
-  int64_t slots, width, columns;  // N; of the tree; of the table.
+  int64_t slots, blocks, columns;  // N; of the tree; of the table.
 } Replay;
 
 // The last three columns are the reward, the replay count and the time of writing.
 static inline double *row_of(const Replay *r, int64_t slot) { return r->table + slot * r->columns; }
+static inline Node *leaf_of(const Replay *r, int64_t slot) { return r->nodes + 2 * r->blocks + slot; }
 static inline void ask_for(const Replay *r, const int64_t *slots, int64_t i, int64_t n) {
   __builtin_prefetch(row_of(r, slots[i + AHEAD < n ? i + AHEAD : i]));
 }
 
-static void lift(Node *t, int64_t width, const int64_t *slots, int64_t n) {
-  for (int shift = 1; width >> shift; shift++) {
-    int64_t nodes = width >> shift, all = nodes < n;
+static void lift(const Replay *r, const int64_t *slots, int64_t n) {
+  Node *t = r->nodes;
+  int64_t blocks = r->blocks;
+  for (int64_t i = 0; i < n; i++) {
+    int64_t b = slots[i] / BLOCK;
+    const Node *leaves = leaf_of(r, b * BLOCK);
+    t[blocks + b].sum = fold(&leaves->sum, 4, BLOCK, 0);
+    t[blocks + b].lowest = fold(&leaves->lowest, 4, BLOCK, 1);
+    t[blocks + b].highest = fold(&leaves->highest, 4, BLOCK, 1);
+  }
+  for (int shift = 1; blocks >> shift; shift++) {
+    int64_t nodes = blocks >> shift, all = nodes < n;
     for (int64_t i = 0; i < (all ? nodes : n); i++) {
-      int64_t k = all ? nodes + i : (width | slots[i]) >> shift;
+      int64_t k = all ? nodes + i : (blocks | slots[i] / BLOCK) >> shift;
       Node a = t[2 * k], b = t[2 * k + 1];
       t[k].sum = a.sum + b.sum;
       t[k].lowest = least(a.lowest, b.lowest);
@@ -153,15 +200,15 @@ static void lift(Node *t, int64_t width, const int64_t *slots, int64_t n) {
 int64_t sample(const Replay *r, int64_t filled, const double *share, int64_t n, double beta,
                int64_t *slots, float *weight, double *written) {
   Node *t = r->nodes;
-  double low = query(&t->lowest, 4, r->width, 1, r->slots, 0, filled);
+  double low = query(&t->lowest, 4, r->blocks, 1, r->slots, 0, filled);
   if (!(low > 0.0 && t[1].sum > 0.0)) return 1;
-  find(&t->sum, 4, r->width, r->slots, filled, share, n, slots);
+  find(&t->sum, 4, r->blocks, r->slots, filled, share, n, slots);
   for (int64_t i = 0; i < n; i++) {
     ask_for(r, slots, i, n);
     double *end = row_of(r, slots[i]) + r->columns;
     end[-2] += 1.0;
     written[i] = end[-1];
-    weight[i] = (float)pow(t[r->width | slots[i]].sum / low, -beta);
+    weight[i] = (float)pow(leaf_of(r, slots[i])->sum / low, -beta);
   }
   return 0;
 }
@@ -224,9 +271,9 @@ int64_t update(const Replay *r, Fusion *f, const int64_t *slots, int64_t n, int6
   for (int64_t i = 0; i < n; i++) {
     double leaf = pow(priority[i], f->alpha);
     memcpy(row_of(r, slots[i]), rows + i * columns, 8 * columns);
-    r->nodes[r->width | slots[i]] = (Node){leaf, leaf, -priority[i], priority[i]};
+    *leaf_of(r, slots[i]) = (Node){leaf, leaf, -priority[i], priority[i]};
   }
-  lift(r->nodes, r->width, slots, n);
+  lift(r, slots, n);
   f->highest = priority[top];
   f->slot = slots[top];
   wrong = 0;
@@ -266,9 +313,9 @@ int64_t write_new(const Replay *r, const Column *columns, int64_t count, int64_t
     end[-2] = 0.0;
     end[-1] = time + i;
     index[slots[i]] = slots[i];
-    r->nodes[r->width | slots[i]] = (Node){leaf, leaf, INFINITY, priority};
+    *leaf_of(r, slots[i]) = (Node){leaf, leaf, INFINITY, priority};
   }
-  lift(r->nodes, r->width, slots, n);
+  lift(r, slots, n);
   free(slots);
   return 0;
 }

@@ -58,7 +58,7 @@ def is_compiled(sampler: SignalSampler, kind: type[SignalSampler]) -> bool:
 
 def _replay(sampler: SignalSampler) -> Replay:
     tree, rows = sampler._sum_tree, sampler.table.rows
-    sizes = tree.size, tree.width, rows.shape[1]
+    sizes = tree.size, tree.blocks, rows.shape[1]
     return Replay(tree.nodes.data_ptr(), rows.data_ptr(), *sizes)
 
 

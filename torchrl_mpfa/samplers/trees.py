@@ -16,6 +16,8 @@ from torchrl_mpfa.storages.schema import as_integers
 
 _ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
+_BLOCK = 16
+"""Leaves that share the lowest node of a compiled tree, also in ``replay.c``."""
 
 
 class CompiledTree:
@@ -35,18 +37,18 @@ class CompiledTree:
 
     @torch.inference_mode(False)
     def __init__(self, capacity: int, nodes: Tensor | None = None, column: int = 0) -> None:
-        self.size, self.width = capacity, 1 << capacity.bit_length()
-        self.nodes = torch.empty(2 * self.width, 1, dtype=torch.double) if nodes is None else nodes
+        self.size, self.blocks = capacity, _blocks(capacity)
+        self.nodes = _nodes(capacity, 1) if nodes is None else nodes
         self._column = column
         self.nodes[:, column] = self.EMPTY
 
     @property
     def _place(self) -> tuple[int, int, int]:
-        """Address of the first node, numbers from node to node, and nodes of the last level."""
-        return self.nodes.data_ptr() + 8 * self._column, self.nodes.shape[1], self.width
+        """Address of the first node, numbers from node to node, and blocks of leaves."""
+        return self.nodes.data_ptr() + 8 * self._column, self.nodes.shape[1], self.blocks
 
     def __getitem__(self, slots: Tensor) -> Tensor:
-        return self.nodes.select(1, self._column)[slots + self.width]
+        return self.nodes.select(1, self._column)[slots + 2 * self.blocks]
 
     def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
         slots, leaf = slots.contiguous(), leaf.double().expand(slots.shape).contiguous()
@@ -151,17 +153,27 @@ class MinLeaves(Leaves):
 def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor]:
     """Return empty trees of sums, of minima and of minima, and priorities, NaN, shape ``[N]``."""
     if device.type == "cpu" and find_loops() is not None:
-        width = 1 << capacity.bit_length()
         # Side by side: two children of a node are one line of the processor's cache.
-        nodes = torch.full((2 * width, 4), torch.nan, dtype=torch.double)
+        nodes, first = _nodes(capacity, 4), 2 * _blocks(capacity)
         kinds = enumerate((SumTree, MinTree, MinTree))
-        return [kind(capacity, nodes, n) for n, kind in kinds], nodes[width : width + capacity, 3]
+        return [kind(capacity, nodes, n) for n, kind in kinds], nodes[first : first + capacity, 3]
     trees: list[Any]
     if device.type == "cpu":
         trees = [kind(capacity) for kind in (SumSegmentTreeFp64, *(MinSegmentTreeFp64,) * 2)]
     else:
         trees = [kind(capacity, device) for kind in (SumLeaves, MinLeaves, MinLeaves)]
     return trees, torch.full((capacity,), torch.nan, dtype=torch.double, device=device)
+
+
+def _blocks(capacity: int) -> int:
+    """Return the smallest power of two of blocks of leaves that hold so many slots."""
+    return 1 << ((capacity - 1) // _BLOCK).bit_length()
+
+
+def _nodes(capacity: int, trees: int) -> Tensor:
+    """Return room for trees, NaN: for their nodes down to blocks, then for all leaves."""
+    count = 2 * _blocks(capacity) + -(-capacity // _BLOCK) * _BLOCK
+    return torch.full((count, trees), torch.nan, dtype=torch.double)
 
 
 def empty_tree_like(tree: Any, capacity: int, device: torch.device) -> Any:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import json
+import mmap
 import os
 from collections import OrderedDict
 from collections.abc import Mapping
+from ctypes import c_size_t, c_void_p
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -282,6 +285,8 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
                 if entry._filename is not None:
                     Path(entry._filename).unlink()
             raise
+        for entry in entries:
+            _expect_random(entry)
 
     def __getstate__(self) -> Any:
         state = {**super().__getstate__(), "_claim": None}
@@ -338,6 +343,17 @@ def allocate(path: str | Path, size: int = 0) -> None:
         except OSError as error:
             error.filename = str(path)
             raise
+
+
+def _expect_random(entry: Tensor) -> None:
+    """Have the system read no more of a mapped file than is asked for.
+
+    Rows of a batch lie far apart: with a file larger than memory, all else that it read ahead would
+    take the place of what is needed.
+    """
+    start = entry.data_ptr() // mmap.PAGESIZE * mmap.PAGESIZE
+    size = entry.data_ptr() + entry.nbytes - start
+    ctypes.CDLL(None).madvise(c_void_p(start), c_size_t(size), mmap.MADV_RANDOM)
 
 
 def _claimed(file: Path, *, existsok: bool) -> NDArray[np.float64]:

@@ -4,10 +4,12 @@ import copy
 import pickle
 import subprocess
 import sys
+from itertools import product
 
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage
+from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
 from tests.mpfa.native.paths import PATHS, take
 from tests.mpfa.second_device import DEVICE
@@ -19,14 +21,17 @@ from torchrl_mpfa import (
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
+    SignalMemmapStorage,
     SignalReplayBuffer,
     SignalTensorStorage,
     native,
 )
 from torchrl_mpfa.native.build import compile_library
-from torchrl_mpfa.samplers.trees import SumTree
+from torchrl_mpfa.samplers.trees import MinTree, SumTree, set_leaves, slots_at
 
 CAPACITY, BATCH = 37, 8
+ONE = torch.ones(1, dtype=torch.double)
+"""Of the sum: rounding can carry a mass past the last slot."""
 
 
 @pytest.fixture(autouse=True)
@@ -117,6 +122,15 @@ def test_a_sampler_made_with_loops_says_that_it_needs_them(monkeypatch):
 def test_statistics_say_which_path_a_buffer_takes(path, monkeypatch):
     take(path, monkeypatch)
     assert make_buffer().stats()["compiled"] == (path == "compiled")
+
+
+@pytest.mark.parametrize("capacity", [2**16, 2**16 + 1, 100_000])
+def test_a_slot_takes_no_more_memory_than_the_documents_say(capacity, monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(capacity)
+    kept = buffer.sampler.table.rows, buffer.sampler._sum_tree.nodes
+    index = 8  # An entry of TorchRL's writers, in the storage.
+    assert sum(tensor.nbytes for tensor in kept) / capacity + index < 96.01
 
 
 def test_adjustments_of_ones_own_take_pytorch(monkeypatch):
@@ -237,6 +251,26 @@ def test_a_tree_rejects_slots_outside_of_it_and_takes_leaves_of_any_precision(mo
     assert tree.query(0, 3) == 3.5
 
 
+@pytest.mark.parametrize("capacity", [1, 15, 16, 17, 32, 33, 64, 100, 1000, 4096])
+def test_trees_are_those_of_torchrl_to_the_last_bit(capacity, monkeypatch):
+    take("compiled", monkeypatch)
+    trees = SumTree(capacity), MinTree(capacity)
+    theirs = SumSegmentTreeFp64(capacity), MinSegmentTreeFp64(capacity)
+    generator = seeded(1)
+    for count in (1, 7, 300):
+        slots = torch.randint(capacity, (count,), generator=generator)
+        leaf = torch.rand(count, dtype=torch.double, generator=generator)
+        set_leaves(slots, leaf, *trees)
+        set_leaves(slots, leaf, *theirs)
+        for start, end in [(0, capacity), *product(range(0, capacity, 9), range(1, capacity, 7))]:
+            if start < end:
+                assert [t.query(start, end) for t in trees] == [t.query(start, end) for t in theirs]
+        for size in (capacity, 1 + capacity // 2):
+            shares = torch.cat([torch.rand(50, dtype=torch.double, generator=generator), ONE])
+            expected = slots_at(shares.clone(), theirs[0], size)
+            assert trees[0].slots_at(shares, size).equal(expected)
+
+
 def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(monkeypatch):
     found = []
     for path in PATHS:
@@ -247,6 +281,18 @@ def test_a_batch_as_large_as_the_storage_and_a_larger_one_keep_the_last_rows(mon
         found.append((buffer[:]["observation"], buffer.sampler.table.rows))
     assert torch.equal(found[0][0], found[1][0])
     torch.testing.assert_close(found[0][1], found[1][1], equal_nan=True, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_each_storage_of_this_package_is_written_by_compiled_loops(kind, monkeypatch):
+    take("compiled", monkeypatch)
+    buffer = make_buffer(16, storage=kind(16))
+    buffer.extend(make_transitions(4))  # Makes room for the form of the transitions.
+    monkeypatch.setattr(buffer, "_extend_checked", None)
+    rows = make_transitions(3, seed=1)
+    slots = buffer.extend(rows)
+    assert slots.tolist() == [4, 5, 6]
+    assert buffer[slots]["observation"].equal(rows["observation"])
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda part: pickle.loads(pickle.dumps(part))])

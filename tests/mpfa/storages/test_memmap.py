@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -91,3 +92,15 @@ def test_import_has_no_hydra_and_folder_in_use_is_rejected(tmp_path):
     assert "signals.memmap is in use by a living storage" in ended.stderr
     assert torch.equal(before.nan_to_num(-1), buffer.storage.signal_table.rows.nan_to_num(-1))
     train_rounds(buffer, 2)
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="Linux says what it was told")
+def test_the_system_reads_no_rows_ahead(tmp_path):
+    make_filled(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
+    mappings = Path("/proc/self/smaps").read_text(encoding="utf-8").split("VmFlags:")
+    flags = [
+        after.splitlines()[0].split()
+        for before, after in pairwise(mappings)
+        if f"{tmp_path}/observation.memmap" in before
+    ]
+    assert flags and all("rr" in names for names in flags)
