@@ -16,6 +16,7 @@ import compare
 import ddpg
 import evaluate
 import export
+import gymnasium_td3
 import play
 import recurrent_td3
 import report
@@ -55,6 +56,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "play": play.main,
     "recurrent_td3": recurrent_td3.main,
     "report": report.main,
+    "gymnasium_td3": gymnasium_td3.main,
     "sb3_replay": sb3_replay.main,
     "stable_baselines": stable_baselines.main,
     "torchrl_ddpg": torchrl_ddpg.main,

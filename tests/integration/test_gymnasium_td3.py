@@ -1,0 +1,79 @@
+"""TD3 on a task of Gymnasium: the rows that it learns from, its scores, and that it learns."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+import gymnasium_td3
+from gymnasium_td3 import SCORES, Task, collect
+
+
+def rounds_of(number: int) -> tuple[Task, TensorDictBase]:
+    """Pendulum, and the rows of so many rounds at random, joined."""
+    task, source = Task("Pendulum-v1", seed=0), np.random.default_rng(0)
+    rows = torch.cat([collect(task, None, source) for _ in range(number)])
+    return task, rows
+
+
+def scores_in(folder: Path) -> list[dict[str, str]]:
+    """The rows of a run's scores."""
+    with (folder / SCORES).open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_follow_each_other_but_for_a_new_episode() -> None:
+    _, rows = rounds_of(41)  # Pendulum's episodes have 200 steps.
+    done = rows["next", "done"].squeeze(-1)
+    assert done.nonzero().squeeze(-1).tolist() == [199, 399]
+    same = (rows["observation"][1:] == rows["next", "observation"][:-1]).all(-1)
+    assert torch.equal(same, ~done[:-1])
+
+
+def test_time_limit_ends_an_episode_without_terminating_it() -> None:
+    _, rows = rounds_of(20)
+    assert rows["next", "done"][-1]
+    assert not rows["next", "terminated"].any()
+
+
+def test_action_reaches_the_whole_range_of_the_task() -> None:
+    task, _ = rounds_of(1)
+    assert task.actions == 1
+    state = task.env.unwrapped.state.copy()  # type: ignore[attr-defined]
+    task.env.step(np.ones(1, np.float32))
+    turned = task.env.unwrapped.state[1] - state[1]  # type: ignore[attr-defined]
+    # 3 g / 2 l sin(angle) + 3 u / m l^2 in 0.05 s, with the highest torque of 2.
+    assert turned == pytest.approx((15.0 * np.sin(state[0]) + 3.0 * 2.0) * 0.05, abs=1e-6)
+
+
+def test_start_below_a_batch_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        gymnasium_td3.main(["--start", "99"])
+    assert "--start must be at least one batch of 100, got 99" in capsys.readouterr().err
+
+
+def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = ["--task", "Pendulum-v1", "--steps", "200", "--start", "100", "--every", "100"]
+    command = [*short, "--folder", str(tmp_path)]
+    folder = gymnasium_td3.main(command)
+    rows = scores_in(folder)
+    assert [row["steps"] for row in rows] == ["100", "200"]
+    assert {row["method"] for row in rows} == {"td3/mpfa_per"}
+    monkeypatch.setattr(gymnasium_td3, "train", lambda options: pytest.fail("made again"))
+    assert gymnasium_td3.main(command) == folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("replay", ["uniform", "mpfa_per"])
+def test_pendulum_swings_up(replay: str, tmp_path: Path) -> None:
+    short = ["--task", "Pendulum-v1", "--steps", "6000", "--start", "1000", "--every", "6000"]
+    short += ["--positive-above", "-2"]
+    folder = gymnasium_td3.main([*short, "--replay", replay, "--folder", str(tmp_path)])
+    [row] = scores_in(folder)
+    # At random some -1,200; a policy that swings up reaches -150.
+    assert float(row["score"]) > -600
