@@ -192,7 +192,8 @@ def _find_paths(
     # cells that wait are kept in a list for each cost, and no heap is needed.
     ny = levels.shape[1]
     costs[:, :] = UNKNOWN
-    heads = np.full(_RING, -1, dtype=np.int32)
+    heads = np.empty(_RING, dtype=np.int32)
+    heads[:] = -1
     after, before, found = links[0], links[1], links[2]
     found[: levels.size] = UNKNOWN
     cell = goal[0] * ny + goal[1]
@@ -200,7 +201,7 @@ def _find_paths(
     total, last, waiting = _least_cost(goal[0], goal[1], start), UNKNOWN, 1
     _put_in_front(heads, after, before, total % _RING, cell)
     while waiting > 0 and total <= last:
-        cell = heads[total % _RING]
+        cell = int(heads[total % _RING])
         if cell < 0:
             total += 1
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -101,6 +102,8 @@ class WalkerBatch:
 
     def clearance(self, index: int, x: float, y: float) -> float:
         """Distance from a point to the nearest walker of a robot [m]; infinite without one."""
+        if not self._arrays.counts[index]:
+            return math.inf
         return float(nearest_walker(self._arrays, index, x, y))
 
     def count_encounters(
