@@ -138,9 +138,11 @@ def measure_remaining(
     """Measure the rest of the shortest path to the goal for the robots that have moved."""
     for robot in range(running.shape[0]):
         if running[robot]:
-            nx, ny = fields.shapes[robot, 0], fields.shapes[robot, 1]
             episodes.remaining[0, robot] = interpolate(
-                fields.values[robot, :nx, :ny],
+                fields.values,
+                robot,
+                fields.shapes[robot, 0],
+                fields.shapes[robot, 1],
                 fields.origins[robot, 0],
                 fields.origins[robot, 1],
                 fields.resolutions[robot],

@@ -216,7 +216,10 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit
 def interpolate(
-    values: NDArray[np.float32],  # [nx, ny]
+    values: NDArray[np.float32],  # [N, most columns, most rows]
+    number: int,  # of the grid
+    nx: int,
+    ny: int,
     x_first: float,  # [m]
     y_first: float,  # [m]
     resolution: float,  # [m]
@@ -224,12 +227,11 @@ def interpolate(
     y: float,  # [m]
 ) -> float:
     """Read a grid between its points, bilinearly; outside as at its edge."""
-    nx, ny = values.shape
     column = min(max((x - x_first) / resolution, 0.0), nx - 1.0)
     row = min(max((y - y_first) / resolution, 0.0), ny - 1.0)
     i, j = int(column), int(row)
     right, above = min(i + 1, nx - 1), min(j + 1, ny - 1)
     a, b = column - i, row - j
-    low = (1.0 - a) * values[i, j] + a * values[right, j]
-    high = (1.0 - a) * values[i, above] + a * values[right, above]
+    low = (1.0 - a) * values[number, i, j] + a * values[number, right, j]
+    high = (1.0 - a) * values[number, i, above] + a * values[number, right, above]
     return (1.0 - b) * low + b * high

@@ -201,7 +201,7 @@ def _find_paths(
     total, last, waiting = _least_cost(goal[0], goal[1], start), UNKNOWN, 1
     _put_in_front(heads, after, before, total % _RING, cell)
     while waiting > 0 and total <= last:
-        cell = int(heads[total % _RING])
+        cell = np.int64(heads[total % _RING])
         if cell < 0:
             total += 1
             continue
