@@ -48,6 +48,8 @@ class WalkerBatch:
             waypoint_counts=np.zeros((count, 0), dtype=np.int64),
             counts=np.zeros(count, dtype=np.int64),
         )
+        self.present = False
+        """True if there are any walkers."""
         self._rooms: dict[int, OrcaRoom] = {}
         """Worlds of the robots around which walkers avoid others, by robot."""
 
@@ -63,6 +65,7 @@ class WalkerBatch:
             }
         )
         arrays.counts[index] = count
+        self.present = bool(arrays.counts.any())
         self._rooms.pop(index, None)
         if any(walker.behavior == "orca" for walker in world.walkers):
             self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
@@ -87,11 +90,6 @@ class WalkerBatch:
                 room.choose(motions[index], states[:count], targets[:count])
         if self.present:
             walk(self._arrays, self._worlds.standing, running, self._time_step)
-
-    @property
-    def present(self) -> bool:
-        """True if there are any walkers."""
-        return bool(self._arrays.counts.any())
 
     def of(self, index: int) -> NDArray[np.float64]:
         """Walkers of a robot: (x, y), speeds in both directions, radius [m, m/s], ``[K, 5]``."""
