@@ -227,7 +227,8 @@ class DistanceField:
         self.window = tuple(
             slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
         )
-        free = grid.free[self.window]
+        # In one layout, so that the loop is compiled once.
+        free = np.ascontiguousarray(grid.free[self.window])
         seeds, inside = self._in_window(cells, free.shape)
         step = grid.resolution * STEP_SCALE
         limit = float(longest)
