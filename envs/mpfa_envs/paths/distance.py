@@ -256,8 +256,8 @@ class DistanceField:
 
         From outside of the window it is that of the window's edge.
         """
-        filled = self.filled
-        return interpolate(filled[None], 0, *filled.shape, *self.origin, self.resolution, x, y)
+        nx, ny = self.filled.shape
+        return interpolate(self.filled[None], 0, nx, ny, *self.origin, self.resolution, x, y)
 
     def length_from(self, start: tuple[float, float]) -> float:
         """Length of the path from a position (x, y) [m]; infinite without one in the window."""

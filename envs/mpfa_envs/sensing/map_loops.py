@@ -192,7 +192,7 @@ def _find_paths(
     # cells that wait are kept in a list for each cost, and no heap is needed.
     ny = levels.shape[1]
     costs[:, :] = UNKNOWN
-    heads = np.empty(_RING, dtype=np.int32)
+    heads = np.empty(_RING, dtype=np.int64)
     heads[:] = -1
     after, before, found = links[0], links[1], links[2]
     found[: levels.size] = UNKNOWN
@@ -201,7 +201,7 @@ def _find_paths(
     total, last, waiting = _least_cost(goal[0], goal[1], start), UNKNOWN, 1
     _put_in_front(heads, after, before, total % _RING, cell)
     while waiting > 0 and total <= last:
-        cell = np.int64(heads[total % _RING])
+        cell = heads[total % _RING]
         if cell < 0:
             total += 1
             continue
@@ -235,7 +235,7 @@ def _least_cost(i: int, j: int, start: tuple[int, int]) -> int:
 
 @njit
 def _put_in_front(
-    heads: NDArray[np.int32],
+    heads: NDArray[np.int64],
     after: NDArray[np.int32],
     before: NDArray[np.int32],
     bucket: int,
@@ -250,7 +250,7 @@ def _put_in_front(
 
 @njit
 def _take_out(
-    heads: NDArray[np.int32],
+    heads: NDArray[np.int64],
     after: NDArray[np.int32],
     before: NDArray[np.int32],
     bucket: int,
