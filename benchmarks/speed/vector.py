@@ -106,6 +106,8 @@ def _torchrl_stepper(world: World) -> Call:
 def measure(*, quick: bool) -> list[Entry]:
     """Measure kinematic robots among 30 obstacles, walkers, or 300 cylinders, map, filter, wheels.
 
+    There are 64 of them, and sixteen on wheels and in ``vector_sixteen``.
+
     The ratios of ``vector_map``, ``vector_walkers``, ``vector_cylinders`` and ``vector_filter`` are
     their times over that of ``vector_kinematic``.
     """
@@ -117,11 +119,12 @@ def measure(*, quick: bool) -> list[Entry]:
         "vector_walkers": _stepper(replace(sparse, walkers=_WALKERS)),
         "vector_cylinders": _stepper(dense),
         "vector_filter": _filter(dense),
+        "vector_sixteen": _stepper(sparse, robots=16),
         "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
     }
     calls["torchrl_vector"] = _torchrl_stepper(sparse)
     timings = take_turns(calls, rounds=3 if quick else 9, seconds=0.1 if quick else 1.0)
-    robots = {"vector_wheels": 16}
+    robots = {"vector_sixteen": 16, "vector_wheels": 16}
     rates = {name: robots.get(name, ROBOTS) / timing.median for name, timing in timings.items()}
     return [
         entry(

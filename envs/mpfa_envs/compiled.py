@@ -16,13 +16,23 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def njit(function: _Function) -> _Function:
-    """Compile a function of numbers and arrays, cached on disk where possible."""
+    """Compile a function of numbers and arrays, cached on disk where possible.
+
+    One with a leading underscore is for other loops: Python cannot call it once it is compiled.
+    """
     # Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy. Where
     # there is no Numba the loop stays as it is, with the same results.
-    # The compiled function releases the interpreter's lock.
+    # The compiled function releases the interpreter's lock. Each wrapper of a function is compiled
+    # as well, which takes a tenth of the time.
     if numba is None:
         return function
-    decorate = partial(numba.njit, nogil=True, error_model="numpy")
+    decorate = partial(
+        numba.njit,
+        nogil=True,
+        error_model="numpy",
+        no_cfunc_wrapper=True,
+        no_cpython_wrapper=function.__name__.startswith("_"),
+    )
     compiled: Any
     try:
         compiled = decorate(function, cache=True)

@@ -74,6 +74,8 @@ class RobotBatch:
             remaining=np.zeros((2, count)),
         )
         """Their episodes so far."""
+        self._most_steps = 0
+        """At least as many time steps as any episode has so far."""
         self.running = np.zeros(count, dtype=np.bool_)
         """True if an episode has begun and not ended, ``[N]``."""
         self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 4))
@@ -98,6 +100,7 @@ class RobotBatch:
             config.goal_radius,
             config.time_step,
         )
+        self._limits = robot.wheel_limits
         self._scales = config.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed
         self._payments = payments_of(config.reward_function)
 
@@ -147,8 +150,7 @@ class RobotBatch:
         if values.shape != (len(self.tasks), 2):
             raise ValueError(f"actions must have shape ({len(self.tasks)}, 2), got {values.shape}")
         speeds = np.empty_like(values)
-        robot = self._config.robot
-        if not scale_actions(values, robot.wheel_limits, speeds):
+        if not scale_actions(values, self._limits, speeds):
             rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
             raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
         return speeds
@@ -161,10 +163,13 @@ class RobotBatch:
     ) -> None:
         """Hold the wheel speeds [m/s], ``[N, 2]``, of the moving robots, ``[N]``, for an action."""
         episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
-        episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
-        last = int(episodes.steps.max()) + self._config.action_repeat
-        if last >= self.trails.shape[1]:
-            self.trails = grown(self.trails, 2 * last + 1)
+        # By a mask, `copyto` takes a third of the time of an assignment.
+        np.copyto(episodes.numbers[REWARD : REWARD + 4], 0.0, where=moving)
+        self._most_steps += self._config.action_repeat
+        if self._most_steps >= self.trails.shape[1]:
+            self._most_steps = int(episodes.steps.max()) + self._config.action_repeat
+        if self._most_steps >= self.trails.shape[1]:
+            self.trails = grown(self.trails, 2 * self._most_steps + 1)
         noise = self.noise
         disturb = None if noise is None else partial(noise.drive, running=running, rngs=rngs)
         for _ in range(self._config.action_repeat):
@@ -189,7 +194,7 @@ class RobotBatch:
                 self._pay_by_function(running)
             if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0, 0.0)):
                 break
-        self.running[moving] = running[moving]
+        np.copyto(self.running, running, where=moving)
 
     def driven(self, index: int) -> NDArray[np.float64]:
         """The wheel speeds that each action of a robot's episode asked for [m/s], ``[A, 2]``."""

@@ -126,9 +126,10 @@ def outcomes(
     episodes: EpisodeArrays, moving: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
     """Rewards, terminations and truncations, ``[N]``; zero and false for robots at rest."""
-    rewards = np.where(moving, episodes.numbers[REWARD : REWARD + 4].sum(axis=0), 0.0)
-    terminated = moving & (episodes.flags[SUCCESS] | episodes.flags[COLLISION])
-    return rewards, terminated, moving & episodes.flags[TIMEOUT]
+    at_goal, hit, approach, cost = episodes.numbers[REWARD : REWARD + 4]
+    rewards = np.where(moving, at_goal + hit + approach + cost, 0.0)
+    success, collision, timeout = episodes.flags
+    return rewards, moving & (success | collision), moving & timeout
 
 
 @njit
@@ -138,9 +139,11 @@ def measure_remaining(
     """Measure the rest of the shortest path to the goal for the robots that have moved."""
     for robot in range(running.shape[0]):
         if running[robot]:
-            nx, ny = fields.shapes[robot, 0], fields.shapes[robot, 1]
             episodes.remaining[0, robot] = interpolate(
-                fields.values[robot, :nx, :ny],
+                fields.values,
+                robot,
+                fields.shapes[robot, 0],
+                fields.shapes[robot, 1],
                 fields.origins[robot, 0],
                 fields.origins[robot, 1],
                 fields.resolutions[robot],

@@ -288,14 +288,15 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
             raise ResetNeeded("no episode is running: call reset() before step()")
         speeds = self._batch.wheel_speeds(actions)
         chosen = read_mask("only", only, self.num_envs)
-        waiting = chosen & ~self._batch.running
-        if waiting.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
-            raise ResetNeeded(
-                f"the episodes of robots {np.flatnonzero(waiting).tolist()} have ended: call "
-                "reset(options={'reset_mask': ...}) before step()"
-            )
         moving = chosen & self._batch.running
-        self._begin(waiting, self._seeded)
+        waiting = chosen & ~moving
+        if waiting.any():
+            if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+                raise ResetNeeded(
+                    f"the episodes of robots {np.flatnonzero(waiting).tolist()} have ended: call "
+                    "reset(options={'reset_mask': ...}) before step()"
+                )
+            self._begin(waiting, self._seeded)
         self._batch.advance(speeds, moving, self._rngs)
         self._batch.sense(chosen, self._rngs)
         rewards, terminated, truncated = outcomes(self._batch.episodes, moving)

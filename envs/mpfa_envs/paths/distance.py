@@ -227,7 +227,8 @@ class DistanceField:
         self.window = tuple(
             slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
         )
-        free = grid.free[self.window]
+        # In one layout, so that the loop is compiled once.
+        free = np.ascontiguousarray(grid.free[self.window])
         seeds, inside = self._in_window(cells, free.shape)
         step = grid.resolution * STEP_SCALE
         limit = float(longest)
@@ -255,7 +256,8 @@ class DistanceField:
 
         From outside of the window it is that of the window's edge.
         """
-        return interpolate(self.filled, *self.origin, self.resolution, x, y)
+        nx, ny = self.filled.shape
+        return interpolate(self.filled[None], 0, nx, ny, *self.origin, self.resolution, x, y)
 
     def length_from(self, start: tuple[float, float]) -> float:
         """Length of the path from a position (x, y) [m]; infinite without one in the window."""

@@ -18,6 +18,24 @@ _BUCKETS: Final = 8
 
 
 @njit
+def _lengths(moves: NDArray[np.int64], step: float) -> NDArray[np.float64]:
+    """Lengths of moves [m]."""
+    lengths = np.empty(len(moves))
+    for k in range(len(moves)):
+        lengths[k] = math.sqrt(moves[k, 0] ** 2 + moves[k, 1] ** 2) * step
+    return lengths
+
+
+@njit
+def _twice(entries: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The entries in an array that has room for as many more."""
+    longer = np.empty(2 * len(entries), np.int64)
+    for k in range(len(entries)):
+        longer[k] = entries[k]
+    return longer
+
+
+@njit
 def path_lengths(
     free: NDArray[np.bool_],  # [nx, ny]
     seeds: NDArray[np.int64],  # [seeds, 2]
@@ -32,11 +50,13 @@ def path_lengths(
     # shortest move: no cell of a bucket is reached by a shorter path through another one of it, so
     # that they need not be sorted (Dial 1969).
     nx, ny = free.shape
-    lengths_to = np.full((nx, ny), math.inf)
+    lengths_to = np.empty((nx, ny))
+    lengths_to[:, :] = math.inf
     settled = np.zeros((nx, ny), np.bool_)
-    lengths = np.sqrt((moves[:, 0] ** 2 + moves[:, 1] ** 2).astype(np.float64)) * step
+    lengths = _lengths(moves, step)
     # Lists of cells: the first of each bucket, and behind each entry the next.
-    heads = np.full(_BUCKETS, -1)
+    heads = np.empty(_BUCKETS, np.int64)
+    heads[:] = -1
     cells, nexts = np.empty(1024, np.int64), np.empty(1024, np.int64)
     entries, waiting = 0, 0
     for k in range(len(seeds)):
@@ -63,8 +83,7 @@ def path_lengths(
         if i == last[0] and j == last[1]:
             limit = min(limit, lengths_to[i, j] + _BEYOND * step)
         if entries + len(moves) > len(cells):
-            cells = np.concatenate((cells, cells))
-            nexts = np.concatenate((nexts, nexts))
+            cells, nexts = _twice(cells), _twice(nexts)
         for k in range(len(moves)):
             to_i, to_j = i + moves[k, 0], j + moves[k, 1]
             if to_i < 0 or to_j < 0 or to_i >= nx or to_j >= ny or not free[to_i, to_j]:
@@ -98,7 +117,7 @@ def astar_tree(
     """Cell before each on a shortest path by A*, the last entry the goal's, ``[nx * ny + 1]``."""
     nx, ny = free.shape
     goal = nx * ny
-    lengths = np.sqrt((moves[:, 0] ** 2 + moves[:, 1] ** 2).astype(np.float64)) * step
+    lengths = _lengths(moves, step)
     lengths_to = np.full(goal + 1, math.inf)
     before = np.full(goal + 1, -1, np.int32)
     # Entries are (whole length, number, cell, length to it, cell before it); of equal lengths the

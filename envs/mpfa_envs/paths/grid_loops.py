@@ -56,6 +56,19 @@ def _measure_boxes(
 
 
 @njit
+def _first_from(ys: NDArray[np.float64], y: float) -> int:
+    """Index of the first of ascending numbers that is not below another."""
+    low, high = 0, len(ys)
+    while low < high:
+        middle = (low + high) // 2
+        if ys[middle] < y:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit
 def _measure_circles(
     circles: NDArray[np.float64],
     x: float,
@@ -68,8 +81,7 @@ def _measure_circles(
         y, radius = circles[k, 1], circles[k, 2]
         off = (circles[k, 0] - x) ** 2
         if off <= (reach + radius) ** 2:
-            low = np.searchsorted(ys, y - radius - reach)
-            high = np.searchsorted(ys, y + radius + reach)
+            low, high = _first_from(ys, y - radius - reach), _first_from(ys, y + radius + reach)
             for j in range(low, high):
                 nearest[j] = min(nearest[j], math.sqrt(off + (y - ys[j]) ** 2) - radius)
 
@@ -117,10 +129,13 @@ def _measure_polygons(
     for end in polygon_ends:
         edges = segments[first:end]
         first = end
-        if max(edges[:, 0].min() - x, x - edges[:, 0].max()) > reach:
+        left, bottom, right, top = math.inf, math.inf, -math.inf, -math.inf
+        for k in range(len(edges)):
+            left, right = min(left, edges[k, 0]), max(right, edges[k, 0])
+            bottom, top = min(bottom, edges[k, 1]), max(top, edges[k, 1])
+        if max(left - x, x - right) > reach:
             continue
-        low = np.searchsorted(ys, edges[:, 1].min() - reach)
-        high = np.searchsorted(ys, edges[:, 1].max() + reach)
+        low, high = _first_from(ys, bottom - reach), _first_from(ys, top + reach)
         _measure_outline(edges, x, ys[low:high], outline, inside)
         for j in range(low, high):
             square[j] = min(square[j], outline[j - low])
@@ -143,12 +158,13 @@ def clearance_grid(
     found = np.empty((nx, ny), np.float32)
     # One column at a time: loops over its rows have no branches and no function calls.
     nearest, square, depth = np.empty(ny), np.empty(ny), np.empty(ny)
-    reach = math.inf
+    reach, longest = math.inf, -math.inf
     for i in range(nx):
         if i > 0:
             # From one column to the next a distance grows by no more than the step between them,
             # so that shapes farther away than this are nearest to no point of the column.
-            reach = max(found[i - 1].max(), 0.0) + 1.001 * (xs[i] - xs[i - 1])
+            reach = max(longest, 0.0) + 1.001 * (xs[i] - xs[i - 1])
+        longest = -math.inf
         for j in range(ny):
             nearest[j] = min(half_size[0] - abs(xs[i]), half_size[1] - abs(ys[j]))
             square[j] = math.inf
@@ -159,6 +175,7 @@ def clearance_grid(
         for j in range(ny):
             from_edges = depth[j] if depth[j] < 0.0 else math.sqrt(square[j])
             found[i, j] = min(nearest[j], from_edges)
+            longest = max(longest, found[i, j])
     return found
 
 
@@ -170,7 +187,10 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
     nx, ny = values.shape
     away_x = np.zeros((nx, ny), np.int32)
     away_y = np.zeros((nx, ny), np.int32)
-    square = np.where(np.isfinite(values), 0, 2_000_000_000)
+    square = np.empty((nx, ny), np.int64)
+    for i in range(nx):
+        for j in range(ny):
+            square[i, j] = 0 if math.isfinite(values[i, j]) else 2_000_000_000
     for sweep in range(2):
         turn = 1 - 2 * sweep
         for column in range(nx):
@@ -196,7 +216,10 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit
 def interpolate(
-    values: NDArray[np.float32],  # [nx, ny]
+    values: NDArray[np.float32],  # [N, most columns, most rows]
+    number: int,  # of the grid
+    nx: int,
+    ny: int,
     x_first: float,  # [m]
     y_first: float,  # [m]
     resolution: float,  # [m]
@@ -204,12 +227,11 @@ def interpolate(
     y: float,  # [m]
 ) -> float:
     """Read a grid between its points, bilinearly; outside as at its edge."""
-    nx, ny = values.shape
     column = min(max((x - x_first) / resolution, 0.0), nx - 1.0)
     row = min(max((y - y_first) / resolution, 0.0), ny - 1.0)
     i, j = int(column), int(row)
     right, above = min(i + 1, nx - 1), min(j + 1, ny - 1)
     a, b = column - i, row - j
-    low = (1.0 - a) * values[i, j] + a * values[right, j]
-    high = (1.0 - a) * values[i, above] + a * values[right, above]
+    low = (1.0 - a) * values[number, i, j] + a * values[number, right, j]
+    high = (1.0 - a) * values[number, i, above] + a * values[number, right, above]
     return (1.0 - b) * low + b * high

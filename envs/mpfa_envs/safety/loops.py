@@ -77,7 +77,7 @@ def filter_actions(
     points, counts = np.empty((states, ranges.shape[2], 3)), np.empty(states, np.int64)
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
-        chosen[robot] = actions[robot]
+        _choose(chosen, robot, actions, robot)
         seen = ranges[robot], directions, origins, speeds[robot]
         _see(seen, body, 0.0, points, counts)
         # Real wheels creep while they are told to stand: what has come too near is left.
@@ -90,10 +90,11 @@ def filter_actions(
         admissible = room > -1.0
         gaps = np.empty(last)
         for k in range(last):
-            across, along = candidates[k] - actions[robot]
+            across = candidates[k, 0] - actions[robot, 0]
+            along = candidates[k, 1] - actions[robot, 1]
             gaps[k] = (across + along) ** 2 + _TURNS * (across - along) ** 2
         if not admissible:
-            chosen[robot] = candidates[last]
+            _choose(chosen, robot, candidates, last)
         if not admissible and body.limits.slow > 0.0:
             # Sectors show less than the truth: the circle that was free before may seem to be
             # blocked now, and the freer one is the better guess.
@@ -106,7 +107,7 @@ def filter_actions(
         for k in order:
             room = _room_after(commands[k], speeds[robot], points, counts, body)
             if room > wants or (not admissible and room > -1.0):
-                chosen[robot] = candidates[k]
+                _choose(chosen, robot, candidates, k)
                 admissible = True
             if room > wants:
                 break
@@ -115,8 +116,16 @@ def filter_actions(
         _see(seen, body, _CREEP, points, counts)
         for k in order:
             if _room_after(commands[k], speeds[robot], points, counts, body) > farther:
-                chosen[robot] = candidates[k]
+                _choose(chosen, robot, candidates, k)
                 break
+
+
+@njit
+def _choose(
+    chosen: NDArray[np.float64], robot: int, actions: NDArray[np.float64], number: int
+) -> None:
+    """Write the action of a number as that of a robot."""
+    chosen[robot, 0], chosen[robot, 1] = actions[number, 0], actions[number, 1]
 
 
 @njit

@@ -192,7 +192,8 @@ def _find_paths(
     # cells that wait are kept in a list for each cost, and no heap is needed.
     ny = levels.shape[1]
     costs[:, :] = UNKNOWN
-    heads = np.full(_RING, -1, dtype=np.int32)
+    heads = np.empty(_RING, dtype=np.int64)
+    heads[:] = -1
     after, before, found = links[0], links[1], links[2]
     found[: levels.size] = UNKNOWN
     cell = goal[0] * ny + goal[1]
@@ -234,7 +235,7 @@ def _least_cost(i: int, j: int, start: tuple[int, int]) -> int:
 
 @njit
 def _put_in_front(
-    heads: NDArray[np.int32],
+    heads: NDArray[np.int64],
     after: NDArray[np.int32],
     before: NDArray[np.int32],
     bucket: int,
@@ -249,7 +250,7 @@ def _put_in_front(
 
 @njit
 def _take_out(
-    heads: NDArray[np.int32],
+    heads: NDArray[np.int64],
     after: NDArray[np.int32],
     before: NDArray[np.int32],
     bucket: int,

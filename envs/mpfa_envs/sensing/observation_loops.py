@@ -99,7 +99,13 @@ def sector_ranges(rays: NDArray[np.float64], sectors: int, median: bool) -> NDAr
 def _sector_range(rays: NDArray[np.float64], first: int, count: int, median: bool) -> float:
     """Range of the sector that begins at a ray: the median of its rays, or the nearest."""
     if median:
-        ordered = np.sort(rays[first : first + count])
+        ordered = rays[first : first + count].copy()
+        for last in range(1, count):
+            place, reach = last, ordered[last]
+            while place > 0 and ordered[place - 1] > reach:
+                ordered[place] = ordered[place - 1]
+                place -= 1
+            ordered[place] = reach
         half = count // 2
         if count % 2 == 1:
             return ordered[half]
@@ -132,7 +138,8 @@ def look_from(
     Where no ray points any more the nearer of the two beside it counts.
     """
     rays, around = seen.shape[0], view > math.tau - 1e-9
-    seen[:] = math.inf
+    hits = np.empty(rays)
+    hits[:] = math.inf
     away_x, away_y = taken[0] - pose[0], taken[1] - pose[1]
     for ray in range(angles.shape[0]):
         angle, distance = angles[ray] + taken[2], ranges[ray]
@@ -146,10 +153,10 @@ def look_from(
         if around:
             place %= rays
         if 0 <= place < rays:
-            seen[place] = min(seen[place], distance, max_range)
-    filled = seen.copy()
+            hits[place] = min(hits[place], distance, max_range)
     for ray in range(rays):
-        if seen[ray] < math.inf:
+        seen[ray] = hits[ray]
+        if hits[ray] < math.inf:
             continue
         for step in (-1, 1):
             place = ray + step
@@ -158,9 +165,8 @@ def look_from(
                     place %= rays
                 if place < 0 or place >= rays:
                     break
-                if seen[place] < math.inf:
-                    filled[ray] = min(filled[ray], seen[place])
+                if hits[place] < math.inf:
+                    seen[ray] = min(seen[ray], hits[place])
                     break
                 place += step
-        filled[ray] = min(filled[ray], max_range)
-    seen[:] = filled
+        seen[ray] = min(seen[ray], max_range)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -47,6 +48,8 @@ class WalkerBatch:
             waypoint_counts=np.zeros((count, 0), dtype=np.int64),
             counts=np.zeros(count, dtype=np.int64),
         )
+        self.present = False
+        """True if there are any walkers."""
         self._rooms: dict[int, OrcaRoom] = {}
         """Worlds of the robots around which walkers avoid others, by robot."""
 
@@ -62,6 +65,7 @@ class WalkerBatch:
             }
         )
         arrays.counts[index] = count
+        self.present = bool(arrays.counts.any())
         self._rooms.pop(index, None)
         if any(walker.behavior == "orca" for walker in world.walkers):
             self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
@@ -87,11 +91,6 @@ class WalkerBatch:
         if self.present:
             walk(self._arrays, self._worlds.standing, running, self._time_step)
 
-    @property
-    def present(self) -> bool:
-        """True if there are any walkers."""
-        return bool(self._arrays.counts.any())
-
     def of(self, index: int) -> NDArray[np.float64]:
         """Walkers of a robot: (x, y), speeds in both directions, radius [m, m/s], ``[K, 5]``."""
         count = self._arrays.counts[index]
@@ -101,6 +100,8 @@ class WalkerBatch:
 
     def clearance(self, index: int, x: float, y: float) -> float:
         """Distance from a point to the nearest walker of a robot [m]; infinite without one."""
+        if not self._arrays.counts[index]:
+            return math.inf
         return float(nearest_walker(self._arrays, index, x, y))
 
     def count_encounters(
