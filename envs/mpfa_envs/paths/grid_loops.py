@@ -196,7 +196,7 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit
 def interpolate(
-    values: NDArray[np.float32],  # [nx, ny]
+    values: NDArray[np.float32] | NDArray[np.float64],  # [nx, ny]
     x_first: float,  # [m]
     y_first: float,  # [m]
     resolution: float,  # [m]

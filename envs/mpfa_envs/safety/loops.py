@@ -79,12 +79,10 @@ def filter_actions(
     for robot in range(actions.shape[0]):
         chosen[robot] = actions[robot]
         seen = ranges[robot], directions, origins, speeds[robot]
-        _see(seen, body, 0.0, points, counts)
-        # Real wheels creep while they are told to stand: what has come too near is left.
-        nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
-        farther = nearest + _GAIN
-        wants = farther if farther - body.radius < _LEAST * body.clearance else -1.0
-        room = _room_after(wanted[robot], speeds[robot], points, counts, body)
+        see(seen, body, 0.0, points, counts)
+        farther = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius) + _GAIN
+        wants = least_room(points[0, : counts[0]], body)
+        room = room_after(wanted[robot], speeds[robot], points, counts, body)
         if room > wants:
             continue
         admissible = room > -1.0
@@ -104,7 +102,7 @@ def filter_actions(
             chosen[robot, 0], chosen[robot, 1] = -side, side
         order = np.argsort(gaps)
         for k in order:
-            room = _room_after(commands[k], speeds[robot], points, counts, body)
+            room = room_after(commands[k], speeds[robot], points, counts, body)
             if room > wants or (not admissible and room > -1.0):
                 chosen[robot] = candidates[k]
                 admissible = True
@@ -112,15 +110,23 @@ def filter_actions(
                 break
         if room > wants:
             continue
-        _see(seen, body, _CREEP, points, counts)
+        see(seen, body, _CREEP, points, counts)
         for k in order:
-            if _room_after(commands[k], speeds[robot], points, counts, body) > farther:
+            if room_after(commands[k], speeds[robot], points, counts, body) > farther:
                 chosen[robot] = candidates[k]
                 break
 
 
 @njit
-def _see(
+def least_room(points: NDArray[np.float64], body: Body) -> float:
+    """Distance of a point that an action must exceed once the robot stands [m]; -1 if any does."""
+    # Real wheels creep while they are told to stand: what has come too near is left.
+    farther = _nearest(0.0, 0.0, points, body.radius) + _GAIN
+    return farther if farther - body.radius < _LEAST * body.clearance else -1.0
+
+
+@njit
+def see(
     # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
     seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     body: Body,
@@ -164,20 +170,26 @@ def _near_points(
         if away <= reach + kept:
             points[count, 0] = x
             points[count, 1] = y
-            # What is nearer already may come nearer by a share of what is left, which lets the
-            # robot pass by it, but not nearer than the least.
-            room = away - body.radius
-            left = min(_LEAST * body.clearance, (1.0 - creep) * room)
-            left = max(left, (1.0 - _SHARE) * room)
-            touch = _TOUCH if room > _AT_RIM else _AT_RIM
-            distance = min(away, kept, body.radius + left) - touch
+            distance = kept_distance(away, body, creep)
             points[count, 2] = distance * distance
             count += 1
     return count
 
 
 @njit
-def _room_after(
+def kept_distance(away: float, body: Body, creep: float) -> float:
+    """Distance that is kept from a point so far away [m]; a share may be taken below the least."""
+    # What is nearer already may come nearer by a share of what is left, which lets the robot pass
+    # by it, but not nearer than the least.
+    room = away - body.radius
+    left = min(_LEAST * body.clearance, (1.0 - creep) * room)
+    left = max(left, (1.0 - _SHARE) * room)
+    touch = _TOUCH if room > _AT_RIM else _AT_RIM
+    return min(away, body.radius + body.clearance, body.radius + left) - touch
+
+
+@njit
+def room_after(
     command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
     speeds: NDArray[np.float64],  # in each state [m/s], [S, 2]
     points: NDArray[np.float64],  # [S, R, 3]

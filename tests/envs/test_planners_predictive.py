@@ -1,0 +1,235 @@
+"""Predictive control: its parts beside plain computations, and its drives."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    Box,
+    Task,
+    TaskConfig,
+    VectorNavigationEnv,
+    World,
+    evaluate,
+    make_planner,
+    run_tasks,
+    world_tasks,
+)
+from mpfa_envs.evaluation.runs import Driver
+from mpfa_envs.paths.field_loops import path_lengths
+from mpfa_envs.paths.grid_loops import MOVES
+from mpfa_envs.planners import PredictiveControl
+from mpfa_envs.planners.predictive_loops import (
+    CELL,
+    ROOMY,
+    Effort,
+    Scene,
+    best_plan,
+    plan_time,
+    room_around,
+)
+from mpfa_envs.robots.model import ROBOTS, RobotModel
+from mpfa_envs.tasks.sets import WorldTask
+
+KOBUKI = TaskConfig(robot="kobuki", memory="map").make_filter()
+BODY = KOBUKI.body
+EFFORT = Effort(turn=0.35, stand=0.5, either=True, circle=0)
+STEPS = 16
+# A doorway of 0.5 m for a robot of 0.36 m, and a pocket before the goal.
+DOOR = World(name="door", boxes=(Box(-0.1, 0.25, 0.1, 5.0), Box(-0.1, -5.0, 0.1, -0.25)))
+POCKET = World(
+    name="pocket",
+    boxes=(Box(1.0, -1.5, 1.2, 1.5), Box(-0.5, 1.3, 1.0, 1.5), Box(-0.5, -1.5, 1.0, -1.3)),
+)
+
+
+def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> Scene:
+    """A robot that drives east with its goal ahead [m], and a wall before it at a distance [m]."""
+    rooms = np.full((121, 121), ROOMY)
+    ranges, angles = np.full(61, math.inf), np.linspace(-0.9, 0.9, 61)
+    if wall < math.inf:
+        ranges = wall / np.cos(angles)
+    directions, origins = np.stack((np.cos(angles), np.sin(angles))), np.zeros((2, 61))
+    room_around(ranges, directions, origins, BODY, rooms)
+    lengths = np.abs(np.arange(200)[:, None] * 0.1 - 9.0 - goal) + np.zeros((1, 200))
+    speeds = np.array([[speed, speed]])
+    points, counts = np.empty((1, 0, 3)), np.zeros(1, np.int64)
+    where = (90.0, 100.0, 0.0), (goal, 0.0, 0.47)
+    return Scene(rooms, points, counts, -1.0, speeds, lengths, 30.0, 0.1, *where)
+
+
+def straight(speed: float) -> np.ndarray:
+    return np.full((STEPS, 2), speed)
+
+
+def test_paths_over_costly_cells_are_those_of_plain_relaxation() -> None:
+    rng = np.random.default_rng(0)
+    factors = rng.choice([0, 5, 8, 150], p=[0.1, 0.5, 0.3, 0.1], size=(12, 15))
+    factors[3, 4] = 5
+    found = path_lengths(
+        factors, np.array([[3, 4]]), np.zeros(1), MOVES, 0.02, math.inf, buckets=400
+    )
+    expected = np.full(factors.shape, math.inf)
+    expected[3, 4] = 0.0
+    for _ in range(factors.size):
+        before = expected.copy()
+        for (i, j), factor in np.ndenumerate(factors):
+            for across, up, a, b, c, d in MOVES.tolist():
+                to = i + across, j + up
+                if not (0 <= to[0] < 12 and 0 <= to[1] < 15) or not factor:
+                    continue
+                crossed = [factors[cell] for cell in (to, (i + a, j + b), (i + c, j + d))]
+                if min(crossed) > 0:
+                    step = max(factor, *crossed) * 0.02 * math.hypot(across, up)
+                    expected[to] = min(expected[to], expected[i, j] + step)
+        if np.array_equal(before, expected):
+            break
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_room_around_is_that_over_what_the_filter_keeps() -> None:
+    rooms = scene(wall=0.5).rooms
+    middle = rooms.shape[0] // 2
+    for ahead in (0.0, 0.15, 0.21, 0.27, 0.36):
+        expected = min(0.5 - ahead - BODY.radius - BODY.clearance, ROOMY)
+        assert rooms[middle + round(ahead / CELL), middle] == pytest.approx(expected, abs=0.003)
+    assert rooms[middle - 20, middle] == ROOMY
+
+
+def test_a_plan_costs_its_time_and_that_from_its_end() -> None:
+    cruising = plan_time(straight(0.7), scene(speed=0.7), BODY, EFFORT, math.inf)
+    # At full speed from here to the goal's center, as the field says.
+    assert cruising == pytest.approx(9.0 / 0.7, abs=0.02)
+    standing = plan_time(straight(0.0), scene(), BODY, EFFORT, math.inf)
+    assert standing == pytest.approx(1.6 + 9.0 / 0.7 + 0.7 / (2 * 0.8), abs=0.02)
+    near = plan_time(straight(0.7), scene(speed=0.7, goal=0.8), BODY, EFFORT, math.inf)
+    assert near == pytest.approx(0.5)  # Within 0.47 m of it.
+    assert plan_time(straight(0.7), scene(speed=0.7), BODY, EFFORT, 12.0) == math.inf
+
+
+def test_a_plan_must_be_able_to_stop_after_its_end() -> None:
+    # 1.12 m, 0.27 m to brake in time steps, and 0.21 m of rim and clearance.
+    assert plan_time(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
+    assert plan_time(straight(0.7), scene(1.61, speed=0.7), BODY, EFFORT, math.inf) < 99.0
+
+
+def test_a_robot_that_cannot_stop_needs_a_circle_after_its_plan() -> None:
+    body = TaskConfig(robot="turtlebot2", memory="map").make_filter().body
+    circle = Effort(turn=0.3, stand=0.5, either=False, circle=33)
+    ahead = straight(0.5)
+    assert plan_time(ahead, scene(0.8 + 0.14 + 0.2, speed=0.5), body, circle, 99.0) == math.inf
+    assert plan_time(ahead, scene(0.8 + 0.14 + 0.3, speed=0.5), body, circle, 99.0) < 99.0
+
+
+def test_the_search_speeds_up_and_rejects_what_the_filter_rejects() -> None:
+    pairs = np.array([(0.7, 0.7), (0.0, 0.0)])
+    noise = np.random.default_rng(0).standard_normal((3, 20, 4, 2))
+    plan = straight(0.0)
+    time = best_plan(plan, pairs, pairs, noise, scene(), BODY, EFFORT)
+    assert plan[0].min() > 0.65 and time < 14.0
+    # No action leaves so much room.
+    shut = scene()._replace(least=math.inf)
+    assert best_plan(plan, pairs, pairs, noise, shut, BODY, EFFORT) == math.inf
+
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    ("turtlebot2", {}),
+    ("kobuki", {"plan": "known"}),
+    ("kobuki", {"latency": 0.3, "goal_radius": 0.2}),
+    ("burger", {}),
+    ("turtlebot4", {"physics": "wheels"}),
+]
+
+
+@pytest.mark.parametrize(("robot", "task"), CASES, ids=str)
+def test_robots_reach_the_goals_of_map_d(robot: str, task: dict[str, Any]) -> None:
+    if task.get("physics") == "wheels":
+        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    results = evaluate(make_planner("mpc", robot=robot), "D", episodes=4, seed=3, **task)
+    assert all(result.success for result in results)
+    assert np.mean([result.spl for result in results]) > 0.85
+
+
+def test_a_robot_of_its_own_limits_drives_ahead_alone() -> None:
+    cart = RobotModel(
+        name="cart",
+        radius=0.3,
+        height=0.4,
+        mass=30.0,
+        wheel_base=0.4,
+        wheel_radius=0.08,
+        min_wheel_speed=-0.3,
+        max_wheel_speed=0.8,
+        wheel_acceleration=0.5,
+        turn_limit=1.2,
+        turn_acceleration=1.5,
+        reverse=False,
+        field_of_view=270.0,
+        lidar_mount=(0.15, 0.0, 0.0),
+    )
+    planner = make_planner("mpc", robot=cart)
+    assert isinstance(planner, Driver)
+    back = []
+
+    def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
+        back.append(env.motions[robot, 3] < -1e-9)
+
+    results = run_tasks(
+        planner, world_tasks("rooms:validation", episodes=3), on_end=keep, **planner.env_arguments
+    )
+    assert all(result.success for result in results) and not any(back)
+
+
+def test_a_narrow_door_and_a_pocket_are_left_behind() -> None:
+    tasks = [
+        WorldTask(DOOR, Task((-2.0, 0.4, 1.0), (2.0, 0.0))),
+        WorldTask(POCKET, Task((-2.0, 0.1, 0.0), (3.0, 0.0))),
+    ]
+    for robot in ("kobuki", "waffle"):
+        planner = make_planner("mpc", robot=robot)
+        wide = tasks[1:] if robot == "waffle" else tasks
+        assert all(each.success for each in run_tasks(planner, wide, **planner.env_arguments))
+
+
+def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
+    planner = PredictiveControl(robot="kobuki")
+    with_map = {"robot": "kobuki", "physics": "kinematic", "memory": "map", "contact": True}
+    env = VectorNavigationEnv(1, world=DOOR, **with_map)
+    options = {"tasks": [Task((-2.0, 0.0, 0.0), (2.0, 0.0))]}
+    seen, _ = env.reset(seed=0, options=options)
+    planner.begin(env, 0)
+    robots = np.zeros(1, np.int64)
+    first = planner.drive(env, robots, seen)
+    lengths = planner._fields[0].lengths[30:36, 54]
+    assert (np.diff(lengths) < 0.0).all()
+    for _ in range(15):  # It is held: nothing is driven.
+        planner.drive(env, robots, seen)
+    raised = planner._fields[0].raised
+    assert raised.max() == 25 and 6 <= np.count_nonzero(raised) <= 9
+    again, _ = env.reset(seed=0, options=options)
+    planner.begin(env, 0)
+    np.testing.assert_array_equal(planner.drive(env, robots, again), first)
+
+
+def test_paths_do_not_depend_on_the_number_of_robots() -> None:
+    tasks = world_tasks("D", episodes=5)
+    drive = partial(run_tasks, tasks=tasks, **PredictiveControl(robot="kobuki").env_arguments)
+    alone, together = (
+        drive(make_planner("mpc", robot="kobuki"), envs_at_once=count) for count in (1, 5)
+    )
+    assert [each.time_s for each in alone] == [each.time_s for each in together]
+
+
+def test_predictive_control_needs_the_map_of_its_robot() -> None:
+    planner = make_planner("mpc", robot="kobuki")
+    with pytest.raises(ValueError, match="memory must be 'map' for mpc, got 'none'"):
+        evaluate(planner, "D", episodes=1, memory="none")
+    assert {name: planner.env_arguments[name] for name in ("memory", "robot")} == {
+        "memory": "map",
+        "robot": ROBOTS["kobuki"],
+    }
