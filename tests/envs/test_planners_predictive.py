@@ -60,7 +60,8 @@ def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> S
     speeds = np.array([[speed, speed]])
     points, counts = np.empty((1, 0, 3)), np.zeros(1, np.int64)
     where = (90.0, 100.0, 0.0), (goal, 0.0, 0.47)
-    return Scene(rooms, points, counts, -1.0, speeds, lengths, 30.0, 0.1, *where)
+    levels = np.zeros((200, 200), np.uint8)
+    return Scene(rooms, points, counts, -1.0, speeds, levels, lengths, 30.0, 0.1, *where)
 
 
 def straight(speed: float) -> np.ndarray:
@@ -116,6 +117,13 @@ def test_a_plan_must_be_able_to_stop_after_its_end() -> None:
     # 1.12 m, 0.27 m to brake in time steps, and 0.21 m of rim and clearance.
     assert plan_time(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
     assert plan_time(straight(0.7), scene(1.61, speed=0.7), BODY, EFFORT, math.inf) < 99.0
+
+
+def test_a_plan_through_a_wall_of_the_map_costs_more_than_any_path() -> None:
+    levels = np.zeros((200, 200), np.uint8)
+    levels[95:98] = 3  # From 0.45 to 0.75 m ahead, where no ray ends.
+    behind = scene(speed=0.7)._replace(levels=levels)
+    assert plan_time(straight(0.7), behind, BODY, EFFORT, math.inf) > 9.0 / 0.7 + 60.0
 
 
 def test_a_robot_that_cannot_stop_needs_a_circle_after_its_plan() -> None:

@@ -297,7 +297,7 @@ class PredictiveControl:
         cosine, sine = math.cos(pose[2]), math.sin(pose[2])
         across, up = known.goal[0] - pose[0], known.goal[1] - pose[1]
         goal = across * cosine + up * sine, up * cosine - across * sine, self._radius
-        field = known.lengths, known.farthest, RESOLUTION
+        field = known.levels, known.lengths, known.farthest, RESOLUTION
         return Scene(self._rooms, points, counts, least, speeds, *field, (*place, pose[2]), goal)
 
 

@@ -11,6 +11,7 @@ from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
 from mpfa_envs.robots.motion_loops import changed, limited
 from mpfa_envs.safety.loops import Body, kept_distance, room_after
+from mpfa_envs.sensing.map_loops import BLOCKED, FACTORS, cell_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,6 +20,8 @@ CELL: Final = 0.03
 """Side of a cell of the robot's surroundings [m]."""
 ROOMY: Final = 0.09
 """Room over the clearance that is kept, above which more of it is worth nothing [m]."""
+_WALL: Final = FACTORS[BLOCKED] / FACTORS[0]
+"""Time in a blocked cell of the map counts so many times more, as a path does."""
 _OFF: Final = 0.12
 """Distance to each side at which the slope of the time field is measured [m]."""
 _SPREAD: Final = (0.45, 0.2, 0.08)
@@ -39,6 +42,8 @@ class Scene(NamedTuple):
     """Room that the filter asks for [m]."""
     speeds: NDArray[np.float64]
     """Of the wheels [m/s], ``[1, 2]``."""
+    levels: NDArray[np.uint8]
+    """Its map, ``[columns, rows]``."""
     lengths: NDArray[np.float64]
     """Cost to go: length of the cheapest path from the cells of its map to the goal [m],
     ``[columns, rows]``."""
@@ -120,6 +125,14 @@ def slope_at(scene: Scene, u: float, v: float) -> tuple[float, float]:
 
 
 @njit
+def _on_map(scene: Scene, x: float, y: float) -> tuple[float, float]:
+    """Column and row of a place in the robot's frame [m]."""
+    cosine, sine = math.cos(scene.pose[2]), math.sin(scene.pose[2])
+    u = scene.pose[0] + (x * cosine - y * sine) / scene.resolution
+    return u, scene.pose[1] + (x * sine + y * cosine) / scene.resolution
+
+
+@njit
 def _time_left(
     scene: Scene,
     place: tuple[float, float, float],  # x, y, heading at a plan's end [m, m, rad]
@@ -128,9 +141,7 @@ def _time_left(
     effort: Effort,
 ) -> float:
     """Time from the end of a plan to the goal [s]: along the path, to turn and to accelerate."""
-    cosine, sine = math.cos(scene.pose[2]), math.sin(scene.pose[2])
-    u = scene.pose[0] + (place[0] * cosine - place[1] * sine) / scene.resolution
-    v = scene.pose[1] + (place[0] * sine + place[1] * cosine) / scene.resolution
+    u, v = _on_map(scene, place[0], place[1])
     fast = body.limits.fast
     time = _length_from(scene, u, v) / fast
     across, up = slope_at(scene, u, v)
@@ -192,6 +203,11 @@ def plan_time(
         if step < last:
             near = 1.0 - max(room, 0.0) / ROOMY
             time += body.time_step * (1.0 + near * near)
+            u, v = _on_map(scene, x, y)
+            columns, rows = scene.levels.shape
+            # A wall that the lidar does not see from here: the sectors show what is before it.
+            if scene.levels[cell_of(u, columns), cell_of(v, rows)] == BLOCKED:
+                time += _WALL * body.time_step
             if math.hypot(x - scene.goal[0], y - scene.goal[1]) <= scene.goal[2]:
                 return time
         step += 1
