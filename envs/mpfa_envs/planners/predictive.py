@@ -64,6 +64,10 @@ _STUCK: Final = 2.5
 """Time after which a robot that has not left a small place is stuck [s]."""
 _PLACE: Final = 0.1
 """Radius of such a place [m]."""
+_LEAVE: Final = 20.0
+"""By how much more it must save until the robot has left a place where it was stuck."""
+_LEFT: Final = 0.3
+"""Distance from such a place at which it has [m]."""
 _RAISED: Final = 25
 """By how much cells cost more before which a robot was stuck: half a meter each."""
 _AHEAD: Final = 12
@@ -85,6 +89,8 @@ class _Field:
     """Length of the cheapest path from each cell to the goal [m], ``[columns, rows]``."""
     farthest: float = -math.inf
     """Length above which none was found [m]."""
+    left: Point | None = None
+    """Place that the robot must leave, as it was stuck there (x, y) [m]."""
     places: deque[Point] = field(default_factory=deque)
     """Where the robot was of late (x, y) [m]."""
 
@@ -211,7 +217,10 @@ class PredictiveControl:
             known = self._fields[robot]
             pose = tuple(poses[robot].tolist())
             scene = self._scene(known, row, pose, maps, robot)
-            time = best_plan(known.plan, *self._tried, self._noise, scene, self._body, self._effort)
+            effort = self._effort
+            if known.left is not None:
+                effort = effort._replace(stand=_LEAVE * effort.stand)
+            time = best_plan(known.plan, *self._tried, self._noise, scene, self._body, effort)
             if time == math.inf:
                 known.plan[:] = max(slow, 0.0)
             actions.append(2.0 * (known.plan[0] - slow) / (fast - slow) - 1.0)
@@ -252,6 +261,8 @@ class PredictiveControl:
     def _is_stuck(self, known: _Field, place: Point) -> bool:
         """Return True if a robot has not left a small place for a while."""
         known.places.append(place)
+        if known.left is not None and math.dist(place, known.left) > _LEFT:
+            known.left = None
         held = self._body.repeat * self._body.time_step
         if len(known.places) <= _STUCK / held:
             return False
@@ -259,6 +270,7 @@ class PredictiveControl:
         stuck = all(math.dist(place, last) <= _PLACE for last in known.places)
         if stuck:
             known.places.clear()
+            known.left = place
         return stuck
 
     def _penalize(self, known: _Field, place: tuple[float, float, float]) -> None:
