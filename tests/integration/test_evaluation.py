@@ -79,8 +79,9 @@ def test_the_script_writes_tables_and_pictures(
     [
         (["astar"], "astar", ["trajectories.png", "episode.gif"]),
         (["dwa", "--memory", "map", "--no-pictures"], "dwa-map", []),
+        (["mpc", "--no-pictures"], "mpc", []),
     ],
-    ids=["astar", "dwa"],
+    ids=["astar", "dwa", "mpc"],
 )
 def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     words: list[str],

@@ -64,7 +64,7 @@ _STUCK: Final = 2.5
 """Time after which a robot that has not left a small place is stuck [s]."""
 _PLACE: Final = 0.1
 """Radius of such a place [m]."""
-_LEAVE: Final = 20.0
+_LEAVE: Final = 3.0
 """By how much more it must save until the robot has left a place where it was stuck."""
 _LEFT: Final = 0.3
 """Distance from such a place at which it has [m]."""
