@@ -30,7 +30,7 @@ from mpfa_envs.planners.predictive_loops import (
     Effort,
     Scene,
     best_plan,
-    plan_time,
+    rollout,
     room_around,
 )
 from mpfa_envs.robots.model import ROBOTS, RobotModel
@@ -51,17 +51,17 @@ POCKET = World(
 def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> Scene:
     """A robot that drives east with its goal ahead [m], and a wall before it at a distance [m]."""
     rooms = np.full((121, 121), ROOMY)
-    ranges, angles = np.full(61, math.inf), np.linspace(-0.9, 0.9, 61)
+    kept, points = BODY.radius + BODY.clearance, np.empty((1, 0, 3))
     if wall < math.inf:
-        ranges = wall / np.cos(angles)
-    directions, origins = np.stack((np.cos(angles), np.sin(angles))), np.zeros((2, 61))
-    room_around(ranges, directions, origins, BODY, rooms)
+        beside = wall * np.tan(np.linspace(-0.9, 0.9, 61))
+        points = np.stack((np.full(61, wall), beside, np.full(61, kept**2)), axis=1)[None]
+    room_around(points[0], 0.0, rooms)
     lengths = np.abs(np.arange(200)[:, None] * 0.1 - 9.0 - goal) + np.zeros((1, 200))
-    speeds = np.array([[speed, speed]])
-    points, counts = np.empty((1, 0, 3)), np.zeros(1, np.int64)
-    where = (90.0, 100.0, 0.0), (goal, 0.0, 0.47)
-    levels = np.zeros((200, 200), np.uint8)
-    return Scene(rooms, points, counts, -1.0, speeds, levels, lengths, 30.0, 0.1, *where)
+    speeds, counts = np.array([[speed, speed]]), np.zeros(1, np.int64)
+    levels, pose = np.zeros((200, 200), np.uint8), (9.0, 10.0, 0.0)
+    return Scene(
+        pose, speeds, points, counts, -1.0, rooms, levels, lengths, (9.0 + goal, 10.0, 0.47)
+    )
 
 
 def straight(speed: float) -> np.ndarray:
@@ -94,55 +94,62 @@ def test_paths_over_costly_cells_are_those_of_plain_relaxation() -> None:
 
 
 def test_the_room_around_is_that_over_what_the_filter_keeps() -> None:
-    rooms = scene(wall=0.5).rooms
-    middle = rooms.shape[0] // 2
-    for ahead in (0.0, 0.15, 0.21, 0.27, 0.36):
-        expected = min(0.5 - ahead - BODY.radius - BODY.clearance, ROOMY)
-        assert rooms[middle + round(ahead / CELL), middle] == pytest.approx(expected, abs=0.003)
-    assert rooms[middle - 20, middle] == ROOMY
+    rooms = np.empty((61, 61))
+    room_around(np.array([(0.5, 0.1, 0.04)]), math.pi / 2, rooms)  # It looks up the map.
+    for (column, row), room in np.ndenumerate(rooms):
+        away = math.hypot(CELL * (column - 30) + 0.1, CELL * (row - 30) - 0.5) - 0.2
+        assert room == pytest.approx(min(away, ROOMY))
 
 
 def test_a_plan_costs_its_time_and_that_from_its_end() -> None:
-    cruising = plan_time(straight(0.7), scene(speed=0.7), BODY, EFFORT, math.inf)
+    cruising = rollout(straight(0.7), scene(speed=0.7), BODY, EFFORT, math.inf)
     # At full speed from here to the goal's center, as the field says.
     assert cruising == pytest.approx(9.0 / 0.7, abs=0.02)
-    standing = plan_time(straight(0.0), scene(), BODY, EFFORT, math.inf)
+    standing = rollout(straight(0.0), scene(), BODY, EFFORT, math.inf)
     assert standing == pytest.approx(1.6 + 9.0 / 0.7 + 0.7 / (2 * 0.8), abs=0.02)
-    near = plan_time(straight(0.7), scene(speed=0.7, goal=0.8), BODY, EFFORT, math.inf)
+    near = rollout(straight(0.7), scene(speed=0.7, goal=0.8), BODY, EFFORT, math.inf)
     assert near == pytest.approx(0.5)  # Within 0.47 m of it.
-    assert plan_time(straight(0.7), scene(speed=0.7), BODY, EFFORT, 12.0) == math.inf
+    assert rollout(straight(0.7), scene(speed=0.7), BODY, EFFORT, 12.0) == math.inf
 
 
 def test_a_plan_must_be_able_to_stop_after_its_end() -> None:
     # 1.12 m, 0.27 m to brake in time steps, and 0.21 m of rim and clearance.
-    assert plan_time(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
-    assert plan_time(straight(0.7), scene(1.61, speed=0.7), BODY, EFFORT, math.inf) < 99.0
+    assert rollout(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
+    assert rollout(straight(0.7), scene(1.61, speed=0.7), BODY, EFFORT, math.inf) < 99.0
 
 
 def test_a_plan_through_a_wall_of_the_map_costs_more_than_any_path() -> None:
     levels = np.zeros((200, 200), np.uint8)
     levels[95:98] = 3  # From 0.45 to 0.75 m ahead, where no ray ends.
     behind = scene(speed=0.7)._replace(levels=levels)
-    assert plan_time(straight(0.7), behind, BODY, EFFORT, math.inf) > 9.0 / 0.7 + 60.0
+    assert rollout(straight(0.7), behind, BODY, EFFORT, math.inf) > 9.0 / 0.7 + 60.0
+
+
+def test_the_cost_to_go_is_not_that_behind_a_thin_wall() -> None:
+    # From the corner of a cell, a wall of a small robot's map runs askew 0.14 m ahead.
+    steps_behind = np.add.outer(np.arange(200), np.arange(200)) - 192
+    lengths = np.where(steps_behind < -1, 15.0, np.where(steps_behind <= 1, 25.0, 4.0))
+    before = scene()._replace(lengths=lengths)
+    assert rollout(straight(0.0), before, BODY, EFFORT, math.inf) > 15.0 / 0.7
 
 
 def test_a_robot_that_cannot_stop_needs_a_circle_after_its_plan() -> None:
     body = TaskConfig(robot="turtlebot2", memory="map").make_filter().body
     circle = Effort(turn=0.3, stand=0.5, either=False, circle=33)
     ahead = straight(0.5)
-    assert plan_time(ahead, scene(0.8 + 0.14 + 0.2, speed=0.5), body, circle, 99.0) == math.inf
-    assert plan_time(ahead, scene(0.8 + 0.14 + 0.3, speed=0.5), body, circle, 99.0) < 99.0
+    assert rollout(ahead, scene(0.8 + 0.14 + 0.2, speed=0.5), body, circle, 99.0) == math.inf
+    assert rollout(ahead, scene(0.8 + 0.14 + 0.3, speed=0.5), body, circle, 99.0) < 99.0
 
 
 def test_the_search_speeds_up_and_rejects_what_the_filter_rejects() -> None:
     pairs = np.array([(0.7, 0.7), (0.0, 0.0)])
     noise = np.random.default_rng(0).standard_normal((3, 20, 4, 2))
     plan = straight(0.0)
-    time = best_plan(plan, pairs, pairs, noise, scene(), BODY, EFFORT)
+    time = best_plan(plan, pairs, noise, scene(), BODY, EFFORT)
     assert plan[0].min() > 0.65 and time < 14.0
     # No action leaves so much room.
     shut = scene()._replace(least=math.inf)
-    assert best_plan(plan, pairs, pairs, noise, shut, BODY, EFFORT) == math.inf
+    assert best_plan(plan, pairs, noise, shut, BODY, EFFORT) == math.inf
 
 
 CASES: list[tuple[str, dict[str, Any]]] = [
@@ -213,11 +220,11 @@ def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
     planner.begin(env, 0)
     robots = np.zeros(1, np.int64)
     first = planner.drive(env, robots, seen)
-    lengths = planner._fields[0].lengths[30:36, 54]
+    lengths = planner._episodes[0].lengths[30:36, 54]
     assert (np.diff(lengths) < 0.0).all()
     for _ in range(15):  # It is held: nothing is driven.
         planner.drive(env, robots, seen)
-    raised = planner._fields[0].raised
+    raised = planner._episodes[0].raised
     assert raised.max() == 25 and 6 <= np.count_nonzero(raised) <= 9
     again, _ = env.reset(seed=0, options=options)
     planner.begin(env, 0)

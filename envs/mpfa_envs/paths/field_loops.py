@@ -27,7 +27,6 @@ def path_lengths(
     step: float,  # [m]
     limit: float,  # [m]
     last: tuple[int, int] = (-1, -1),  # Cells much farther than this one are left out.
-    beyond: float = _BEYOND,  # So many steps are not much.
     buckets: int = _BUCKETS,  # More than the longest move has steps.
 ) -> NDArray[np.float64]:
     """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
@@ -64,7 +63,7 @@ def path_lengths(
             continue
         settled[i, j] = True
         if i == last[0] and j == last[1]:
-            limit = min(limit, lengths_to[i, j] + beyond * step)
+            limit = min(limit, lengths_to[i, j] + _BEYOND * step)
         if entries + len(moves) > len(cells):
             cells = np.concatenate((cells, cells))
             nexts = np.concatenate((nexts, nexts))

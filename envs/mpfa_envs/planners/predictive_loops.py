@@ -10,8 +10,9 @@ import numpy as np
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
 from mpfa_envs.robots.motion_loops import changed, limited
-from mpfa_envs.safety.loops import Body, kept_distance, room_after
+from mpfa_envs.safety.loops import Body, room_after
 from mpfa_envs.sensing.map_loops import BLOCKED, FACTORS, cell_of
+from mpfa_envs.sensing.map_memory import RESOLUTION
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,72 +24,48 @@ ROOMY: Final = 0.09
 _WALL: Final = FACTORS[BLOCKED] / FACTORS[0]
 """Time in a blocked cell of the map counts so many times more, as a path does."""
 _OFF: Final = 0.12
-"""Distance to each side at which the slope of the time field is measured [m]."""
+"""Distance to each side at which the slope of the cost-to-go is measured [m]."""
 _SPREAD: Final = (0.45, 0.2, 0.08)
 """Spread of the sampled speeds in each round, over the fastest."""
 
 
 class Scene(NamedTuple):
-    """What a robot knows when it decides, in its own frame unless it says otherwise."""
+    """What a robot knows when it decides; places are in meters from the first cell of its map."""
 
-    rooms: NDArray[np.float64]
-    """Room of the robot's center over what it keeps from lidar hits, at most :data:`ROOMY` [m], in
-    cells around it, ``[n, n]``."""
-    points: NDArray[np.float64]
-    """What the filter sees, ``[1, P, 3]``."""
-    counts: NDArray[np.int64]
-    """The number of these points, ``[1]``."""
-    least: float
-    """Room that the filter asks for [m]."""
-    speeds: NDArray[np.float64]
-    """Of the wheels [m/s], ``[1, 2]``."""
-    levels: NDArray[np.uint8]
-    """Its map, ``[columns, rows]``."""
-    lengths: NDArray[np.float64]
-    """Cost to go: length of the cheapest path from the cells of its map to the goal [m],
-    ``[columns, rows]``."""
-    farthest: float
-    """Length that counts where there is none [m]."""
-    resolution: float
-    """Side of a cell of the map [m]."""
-    pose: tuple[float, float, float]
-    """Of the robot on its map (x, y, heading) [cells, cells, rad]."""
-    goal: tuple[float, float, float]
-    """Position (x, y) of the goal and the distance that reaches it [m]."""
+    pose: tuple[float, float, float]  # x, y, heading [m, m, rad]
+    speeds: NDArray[np.float64]  # of the wheels [m/s], [1, 2]
+    points: NDArray[np.float64]  # what the filter sees, [1, P, 3]
+    counts: NDArray[np.int64]  # the number of these points, [1]
+    least: float  # room that the filter asks for [m]
+    rooms: NDArray[np.float64]  # room in cells around the robot, at most ROOMY [m], [n, n]
+    levels: NDArray[np.uint8]  # its map, [columns, rows]
+    lengths: NDArray[np.float64]  # of the cheapest paths to the goal [m], [columns, rows]
+    goal: tuple[float, float, float]  # x, y and the distance that reaches it [m]
 
 
 class Effort(NamedTuple):
-    """What a robot is good at."""
+    """What costs a robot time besides its path."""
 
-    turn: float
-    """Time to turn by a radian [s]."""
-    stand: float
-    """Time that a plan must save to begin without moving [s]. Where a plan ends before something
-    that only seems to close the path, to wait first would cost nothing, decision by decision."""
-    either: bool
-    """True if it drives backwards as well as forwards."""
-    circle: int
-    """Time steps of a whole turning circle of a robot that cannot stop; 0 for others."""
+    turn: float  # time to turn by a radian [s]
+    stand: float  # time that a plan must save to begin without moving [s]
+    either: bool  # True if it drives backwards as well as forwards
+    circle: int  # time steps of a full circle if it cannot stop, else 0
 
 
 @njit
 def room_around(
-    ranges: NDArray[np.float64],  # [m], [R]
-    directions: NDArray[np.float64],  # [2, R]
-    origins: NDArray[np.float64],  # [m], [2, R]
-    body: Body,
+    points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [P, 3]
+    heading: float,  # of the robot [rad]
     rooms: NDArray[np.float64],  # [n, n]
 ) -> None:
-    """Write the room of the robot's center in each cell around it, from what the lidar hit."""
+    """Write how far the robot's center would be from what it must keep off, in cells around it."""
     rooms[:] = ROOMY
     middle, last = rooms.shape[0] // 2, rooms.shape[0] - 1
-    for ray in range(ranges.shape[0]):
-        if ranges[ray] == math.inf:
-            continue
-        x = origins[0, ray] + ranges[ray] * directions[0, ray]
-        y = origins[1, ray] + ranges[ray] * directions[1, ray]
-        kept = kept_distance(math.hypot(x, y), body, 0.0)
-        u, v, wide = middle + x / CELL, middle + y / CELL, (kept + ROOMY) / CELL
+    cosine, sine = math.cos(heading) / CELL, math.sin(heading) / CELL
+    for point in range(points.shape[0]):
+        x, y, kept = points[point, 0], points[point, 1], math.sqrt(points[point, 2])
+        u, v = middle + x * cosine - y * sine, middle + x * sine + y * cosine
+        wide = (kept + ROOMY) / CELL
         for i in range(max(math.ceil(u - wide), 0), min(math.floor(u + wide), last) + 1):
             for j in range(max(math.ceil(v - wide), 0), min(math.floor(v + wide), last) + 1):
                 away = CELL * math.sqrt((i - u) * (i - u) + (j - v) * (j - v))
@@ -96,58 +73,41 @@ def room_around(
 
 
 @njit
-def _room_at(rooms: NDArray[np.float64], x: float, y: float) -> float:
-    """Room at a place in the robot's frame [m]."""
-    first = -(rooms.shape[0] // 2) * CELL
-    return interpolate(rooms, first, first, CELL, x, y)
+def _room_at(scene: Scene, x: float, y: float) -> float:
+    """Room at a place [m]."""
+    half = (scene.rooms.shape[0] // 2) * CELL
+    return interpolate(scene.rooms, scene.pose[0] - half, scene.pose[1] - half, CELL, x, y)
 
 
 @njit
-def _length_from(scene: Scene, u: float, v: float) -> float:
-    """Length of the path from a place on the map (column, row), by the best cell around it [m]."""
-    lengths = scene.lengths
-    best = scene.farthest
-    left, low = math.floor(u), math.floor(v)
-    for i in range(max(left - 1, 0), min(left + 3, lengths.shape[0])):
-        for j in range(max(low - 1, 0), min(low + 3, lengths.shape[1])):
-            if lengths[i, j] < best:
-                gap = math.sqrt((i - u) * (i - u) + (j - v) * (j - v))
-                best = min(best, lengths[i, j] + scene.resolution * gap)
+def _cost_to_go(lengths: NDArray[np.float64], x: float, y: float) -> float:
+    """Length of the path from a place [m], by the best cell around it."""
+    u, v, best = x / RESOLUTION, y / RESOLUTION, math.inf
+    left, low = cell_of(u - 0.5, lengths.shape[0]), cell_of(v - 0.5, lengths.shape[1])
+    # Farther cells may be behind a wall: for a small robot one is two blocked cells thick.
+    for i in range(left, min(left + 2, lengths.shape[0])):
+        for j in range(low, min(low + 2, lengths.shape[1])):
+            gap = RESOLUTION * math.sqrt((i - u) * (i - u) + (j - v) * (j - v))
+            best = min(best, lengths[i, j] + gap)
     return best
 
 
 @njit
-def slope_at(scene: Scene, u: float, v: float) -> tuple[float, float]:
-    """Slope of the path's length across and up the map at a place (column, row)."""
-    off = _OFF / scene.resolution
-    across = _length_from(scene, u + off, v) - _length_from(scene, u - off, v)
-    return across, _length_from(scene, u, v + off) - _length_from(scene, u, v - off)
-
-
-@njit
-def _on_map(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Column and row of a place in the robot's frame [m]."""
-    cosine, sine = math.cos(scene.pose[2]), math.sin(scene.pose[2])
-    u = scene.pose[0] + (x * cosine - y * sine) / scene.resolution
-    return u, scene.pose[1] + (x * sine + y * cosine) / scene.resolution
-
-
-@njit
-def _time_left(
-    scene: Scene,
+def _terminal_cost(
+    lengths: NDArray[np.float64],
     place: tuple[float, float, float],  # x, y, heading at a plan's end [m, m, rad]
     speed: float,  # forward there [m/s]
     body: Body,
     effort: Effort,
 ) -> float:
     """Time from the end of a plan to the goal [s]: along the path, to turn and to accelerate."""
-    u, v = _on_map(scene, place[0], place[1])
+    x, y, heading = place
     fast = body.limits.fast
-    time = _length_from(scene, u, v) / fast
-    across, up = slope_at(scene, u, v)
+    time = _cost_to_go(lengths, x, y) / fast
+    across = _cost_to_go(lengths, x + _OFF, y) - _cost_to_go(lengths, x - _OFF, y)
+    up = _cost_to_go(lengths, x, y + _OFF) - _cost_to_go(lengths, x, y - _OFF)
     steep = math.hypot(across, up)
     if steep > 0.0:
-        heading = scene.pose[2] + place[2]
         ahead = -(across * math.cos(heading) + up * math.sin(heading)) / steep
         beside = abs(up * math.cos(heading) - across * math.sin(heading)) / steep
         time += effort.turn * math.atan2(beside, abs(ahead) if effort.either else ahead)
@@ -157,7 +117,7 @@ def _time_left(
 
 
 @njit
-def plan_time(
+def rollout(
     plan: NDArray[np.float64],  # wheel speeds of each time step [m/s], [T, 2]
     scene: Scene,
     body: Body,
@@ -166,19 +126,20 @@ def plan_time(
 ) -> float:
     """Time to the goal by a plan [s]; infinite if it comes too near to something, or above most.
 
-    The last state must be safe: the robot stands still in time or, where it cannot stand still,
-    drives a full circle.
+    The terminal constraint: after the plan the robot stands still in time or, where it cannot stand
+    still, drives a full circle.
     """
     limits, parts = body.limits, math.ceil(body.limits.fast * body.time_step / (1.2 * CELL))
     part = body.time_step / parts
     left, right = scene.speeds[0, 0], scene.speeds[0, 1]
-    x, y, heading, time = 0.0, 0.0, 0.0, 0.0
+    x, y, heading = scene.pose
     # Between the cells, the room of the place where it stands may seem to be below zero.
-    needed = min(_room_at(scene.rooms, 0.0, 0.0), 0.0) - 1e-9
+    needed, time = min(_room_at(scene, x, y), 0.0) - 1e-9, 0.0
     step, last = 0, plan.shape[0]
     while True:
         if step == last:
-            time += _time_left(scene, (x, y, heading), 0.5 * (left + right), body, effort)
+            place = x, y, heading
+            time += _terminal_cost(scene.lengths, place, 0.5 * (left + right), body, effort)
         if time >= most:
             return math.inf
         if step < last:
@@ -197,16 +158,15 @@ def plan_time(
             x += along * math.cos(heading + 0.5 * turn)
             y += along * math.sin(heading + 0.5 * turn)
             heading += turn
-            room = _room_at(scene.rooms, x, y)
+            room = _room_at(scene, x, y)
             if room < needed:
                 return math.inf
         if step < last:
             near = 1.0 - max(room, 0.0) / ROOMY
             time += body.time_step * (1.0 + near * near)
-            u, v = _on_map(scene, x, y)
-            columns, rows = scene.levels.shape
+            column = cell_of(x / RESOLUTION, scene.levels.shape[0])
             # A wall that the lidar does not see from here: the sectors show what is before it.
-            if scene.levels[cell_of(u, columns), cell_of(v, rows)] == BLOCKED:
+            if scene.levels[column, cell_of(y / RESOLUTION, scene.levels.shape[1])] == BLOCKED:
                 time += _WALL * body.time_step
             if math.hypot(x - scene.goal[0], y - scene.goal[1]) <= scene.goal[2]:
                 return time
@@ -216,31 +176,24 @@ def plan_time(
 @njit
 def best_plan(
     plan: NDArray[np.float64],  # the last one; the best one is written here, [T, 2]
-    firsts: NDArray[np.float64],  # speeds that are tried alone [m/s], [A, 2]
-    pairs: NDArray[np.float64],  # speeds that are tried after one another [m/s], [B, 2]
+    pairs: NDArray[np.float64],  # speeds that are tried after one another [m/s], [K, 2]
     noise: NDArray[np.float64],  # [rounds, samples, 4, 2]
     scene: Scene,
     body: Body,
     effort: Effort,
 ) -> float:
     """Find the plan that takes the least time [s]; infinite if the filter lets none pass."""
-    limits, steps, best, repeat = body.limits, plan.shape[0], math.inf, body.repeat
+    limits, steps, repeat = body.limits, plan.shape[0], body.repeat
     trial, chosen = np.empty_like(plan), np.empty_like(plan)
-    # What was planned, from now on, and to stand.
+    # What was planned, from now on.
     trial[: steps - repeat], trial[steps - repeat :] = plan[repeat:], plan[-1]
     trial[:repeat] = trial[0]
-    best = _better(trial, chosen, best, scene, body, effort)
-    trial[:] = max(limits.slow, 0.0)
-    best = _better(trial, chosen, best, scene, body, effort)
-    for first in range(firsts.shape[0]):
-        trial[:] = firsts[first]
-        best = _better(trial, chosen, best, scene, body, effort)
+    best = _better(trial, chosen, math.inf, scene, body, effort)
     turn = max(steps // 4, repeat)
     for first in range(pairs.shape[0]):
         for second in range(pairs.shape[0]):
-            if first != second:
-                trial[:turn], trial[turn:] = pairs[first], pairs[second]
-                best = _better(trial, chosen, best, scene, body, effort)
+            trial[:turn], trial[turn:] = pairs[first], pairs[second]
+            best = _better(trial, chosen, best, scene, body, effort)
     if best == math.inf:
         return best
     ends = max(steps // 8, repeat), 3 * steps // 8, 5 * steps // 8, steps
@@ -270,9 +223,10 @@ def _better(
     effort: Effort,
 ) -> float:
     """Choose a plan if it is better than the best so far, and the filter lets it begin so [s]."""
+    # A robot that stands sees the same again: to wait for a better plan must not be free.
     slow = 1.0 - min(max(abs(trial[0, 0]), abs(trial[0, 1])) / body.limits.fast, 1.0)
     waits = effort.stand * slow * slow
-    time = plan_time(trial, scene, body, effort, best - waits) + waits
+    time = rollout(trial, scene, body, effort, best - waits) + waits
     if time >= best:
         return best
     first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))

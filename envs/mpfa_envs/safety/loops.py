@@ -170,22 +170,16 @@ def _near_points(
         if away <= reach + kept:
             points[count, 0] = x
             points[count, 1] = y
-            distance = kept_distance(away, body, creep)
+            # What is nearer already may come nearer by a share of what is left, which lets the
+            # robot pass by it, but not nearer than the least.
+            room = away - body.radius
+            left = min(_LEAST * body.clearance, (1.0 - creep) * room)
+            left = max(left, (1.0 - _SHARE) * room)
+            touch = _TOUCH if room > _AT_RIM else _AT_RIM
+            distance = min(away, kept, body.radius + left) - touch
             points[count, 2] = distance * distance
             count += 1
     return count
-
-
-@njit
-def kept_distance(away: float, body: Body, creep: float) -> float:
-    """Distance that is kept from a point so far away [m]; a share may be taken below the least."""
-    # What is nearer already may come nearer by a share of what is left, which lets the robot pass
-    # by it, but not nearer than the least.
-    room = away - body.radius
-    left = min(_LEAST * body.clearance, (1.0 - creep) * room)
-    left = max(left, (1.0 - _SHARE) * room)
-    touch = _TOUCH if room > _AT_RIM else _AT_RIM
-    return min(away, body.radius + body.clearance, body.radius + left) - touch
 
 
 @njit
