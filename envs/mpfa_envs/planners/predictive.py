@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.vector import VectorNavigationEnv
     from mpfa_envs.safety.loops import Body
+    from mpfa_envs.sensing.map_loops import MapArrays
     from mpfa_envs.worlds.shapes import Point
 
 _FACTORS: Final = np.array((5, 8, 150, 1000))
@@ -60,6 +61,7 @@ class _Episode:
     """What a robot remembers during one episode."""
 
     plan: NDArray[np.float64]  # wheel speeds of the time steps ahead [m/s], [T, 2]
+    goal: Point  # [m]
     levels: NDArray[np.uint8]  # its map when the lengths were found, [columns, rows]
     raised: NDArray[np.int64]  # by how much cells cost more since it was stuck before them
     lengths: NDArray[np.float64]  # of the cheapest paths from each cell to the goal [m]
@@ -127,16 +129,17 @@ class PredictiveControl:
         Raises:
             ValueError: If robots have no map, or the filter cannot keep this robot off obstacles.
         """
-        if env.maps is None:
-            raise ValueError(f"memory must be 'map' for mpc, got {env.config.memory!r}")
+        maps, task = _maps(env), env.tasks[robot]
+        if task is None:
+            raise ValueError(f"robot {robot} must have begun an episode to plan for")
         if env.config is not self._config:
             self._prepare(env.config)
         plan = np.full((self._ahead.repeat, 2), max(self._body.limits.slow, 0.0))
-        columns, rows = env.maps.shapes[robot]
+        columns, rows = maps.shapes[robot]
         # No cell is on a map of this level: the lengths are found in the first decision.
         levels = np.full((columns, rows), BLOCKED + 1, np.uint8)
         raised = np.zeros((columns, rows), np.int64)
-        self._episodes[robot] = _Episode(plan, levels, raised, np.empty((columns, rows)))
+        self._episodes[robot] = _Episode(plan, task.goal, levels, raised, raised.astype(float))
 
     def _prepare(self, config: TaskConfig) -> None:
         """Take robot, lidar, filter and time steps from a task."""
@@ -153,7 +156,8 @@ class PredictiveControl:
         either = limits.reverse and limits.slow < -0.9 * limits.fast
         turn, wait = _TURN / config.robot.max_angular_speed, _WAIT * _LENGTH / limits.fast
         self._effort = Effort(turn, wait, either, circle)
-        half = math.ceil((_LENGTH + 0.5 * limits.fast**2 / limits.acceleration + 0.1) / CELL)
+        reach = limits.fast * (steps * body.time_step + 0.5 * limits.fast / limits.acceleration)
+        half = math.ceil((reach + 0.1) / CELL)
         self._rooms = np.empty((2 * half + 1, 2 * half + 1))
         self._radius = _REACHED * config.goal_radius
         # Set last: what was rejected is rejected again.
@@ -180,13 +184,12 @@ class PredictiveControl:
         self, env: VectorNavigationEnv, robot: int, observation: NDArray[np.float32]
     ) -> Scene:
         """What a robot knows when it decides."""
-        episode, maps, task = self._episodes[robot], env.maps, env.tasks[robot]
-        assert maps is not None and task is not None  # As the episode has begun.
+        episode, maps = self._episodes[robot], _maps(env)
         columns, rows = episode.levels.shape
         levels, (left, low) = maps.levels[robot, :columns, :rows], maps.origins[robot].tolist()
         x, y, heading = env.moments[robot, 4:7].tolist()
         pose = x - left, y - low, heading
-        goal = task.goal[0] - left, task.goal[1] - low, self._radius
+        goal = episode.goal[0] - left, episode.goal[1] - low, self._radius
         seen = self._keep.seen(observation[None])
         points, counts = np.empty((1, seen[0].shape[1], 3)), np.empty(1, np.int64)
         see(seen, self._ahead, 0.0, points, counts)
@@ -232,6 +235,13 @@ class PredictiveControl:
             if max(map(abs, at)) <= half and self._rooms[half + at[0], half + at[1]] < 0.0:
                 break
         episode.raised[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] += _RAISED
+
+
+def _maps(env: VectorNavigationEnv) -> MapArrays:
+    """The robots' maps; raise an error if they have none."""
+    if env.maps is None:
+        raise ValueError(f"memory must be 'map' for mpc, got {env.config.memory!r}")
+    return env.maps
 
 
 def _cell(place: tuple[float, ...], shape: tuple[int, ...]) -> tuple[int, int]:
