@@ -30,7 +30,10 @@ from training.worlds import family
 
 _DRIVER = ["robot", "driver", "filter"]
 _COUNTED = ["success", "collision", "timeout"]
-_NAMES = {"dwa": "`dwa`", "dwa map": "`dwa --memory map`", "ddpg": "DDPG", "td3": "TD3"}
+_NAMES = {
+    **{"dwa": "`dwa`", "dwa map": "`dwa --memory map`", "ddpg": "DDPG", "td3": "TD3"},
+    "mpc known": "`mpc --plan known`",
+}
 _REFERENCE = "dwa map"
 """Driver whose times others are divided by, of the same robot."""
 _TASK = ["world", "episode"]
@@ -43,10 +46,11 @@ def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]
         if "words" not in asked:  # Episodes of a training.
             continue
         run = read_json(path.parents[1] / files.SETTINGS)
-        planner = " ".join(asked[name] for name in ("policy", "memory") if name in asked)
+        named = ("policy", "memory", "plan") if "policy" in asked else ()
+        planner = " ".join(asked[name] for name in named if asked.get(name, "none") != "none")
         driver = {
             "robot": resolve_robot(asked.get("robot") or _trained_with(asked, run)),
-            "driver": planner.removesuffix(" none") or asked["card"]["learner"],
+            "driver": planner or asked["card"]["learner"],
             "seed": asked.get("card", asked)["seed"],
             "filter": "filter" in asked,
         }

@@ -164,7 +164,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if (options.path is None) == (options.policy is None):
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":
-        parser.error(f"--memory {options.memory} is for --policy dwa alone")
+        parser.error(f"--memory {options.memory} is for --policy dwa alone: mpc has a map")
     try:
         options.robot = options.robot and resolve_robot(options.robot)
         options.names = parse_worlds(options.worlds)

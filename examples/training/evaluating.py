@@ -23,14 +23,14 @@ from mpfa_envs import (
 )
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
-from mpfa_envs.planners import DynamicWindow, MapPlanner
+from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
 from mpfa_envs.robots.model import ROBOTS, RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from training.files import short_name
 from training.worlds import worlds_label
 
-Drivable = Policy | MapPlanner | DynamicWindow | Filtered
+Drivable = Policy | MapPlanner | DynamicWindow | PredictiveControl | Filtered
 """Drivers of a robot, with the ``env_arguments`` that they need."""
 
 
@@ -127,7 +127,7 @@ def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
     return moved
 
 
-def filtered(policy: Policy | MapPlanner | DynamicWindow, **env_arguments: Any) -> Filtered:
+def filtered(policy: Drivable, **env_arguments: Any) -> Filtered:
     """Put a policy behind the filter that keeps the robot off obstacles that its lidar sees."""
     return Filtered(policy, TaskConfig(**policy.env_arguments | env_arguments).make_filter())
 

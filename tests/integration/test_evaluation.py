@@ -79,8 +79,9 @@ def test_the_script_writes_tables_and_pictures(
     [
         (["astar"], "astar", ["trajectories.png", "episode.gif"]),
         (["dwa", "--memory", "map", "--no-pictures"], "dwa-map", []),
+        (["mpc", "--no-pictures"], "mpc", []),
     ],
-    ids=["astar", "dwa"],
+    ids=["astar", "dwa", "mpc"],
 )
 def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     words: list[str],
@@ -99,12 +100,13 @@ def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     assert list(summary["success"]) == [1.0, 1.0, 1.0]
     found = json.loads((folder / "evaluation.json").read_text())
     assert found["worlds"]["B"]["success"] == 1.0
-    assert found["path_length"] > 1.0 and found["decision_s"] > 0.0
-    assert (found["plan_s"] > 1e-4) == (name == "astar")
+    assert found["path_length"] > 1.0
+    # Only a planner on the known map takes longer before its first decision than for each.
+    assert (found["plan_s"] > found["decision_s"] > 0.0) == (name == "astar")
     assert len(read_table(folder / "episodes.csv")) == 4
     settings = json.loads((folder / "settings.json").read_text())
     assert settings["policy"] == words[0]
-    assert settings["memory"] == ("none" if name == "astar" else "map")
+    assert settings["memory"] == ("map" if "--memory" in words else "none")
     assert {path.name for path in folder.iterdir()} >= {*pictures, "summary.csv"}
     shown = capsys.readouterr().out
     assert f"\n{name}, physics: kinematic\n" in shown and "plan_ms" in shown

@@ -34,6 +34,8 @@ from mpfa_envs.worlds.world import World
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.sensing.map_loops import MapArrays
+
 _EMPTY = World(name="empty")
 _MASKS = tuple(f"_{name}" for name in INFO_TYPES)
 _INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
@@ -183,6 +185,12 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
     def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """The infos as two tables, ``[3, N]`` and ``[15, N]``: the rows are flags and numbers."""
         return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()
+
+    @property
+    def maps(self) -> MapArrays | None:
+        """The robots' maps, which change as they drive; None without ``memory="map"``."""
+        memory = self._batch.memory
+        return None if memory is None else memory.arrays
 
     def check_task(
         self,

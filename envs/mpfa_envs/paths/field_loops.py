@@ -14,7 +14,7 @@ from mpfa_envs.compiled import njit
 _BEYOND: Final = 3.0
 """Steps by which the last cell that is needed is exceeded: more than a move is long."""
 _BUCKETS: Final = 8
-"""Number of buckets; a move leads three ahead at most."""
+"""Number of buckets; a move over free cells leads three ahead at most."""
 
 
 @njit
@@ -37,13 +37,15 @@ def _twice(entries: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @njit
 def path_lengths(
-    free: NDArray[np.bool_],  # [nx, ny]
+    # True, or by how much longer a move counts there; 0 where none leads, [nx, ny].
+    free: NDArray[np.bool_] | NDArray[np.int64],
     seeds: NDArray[np.int64],  # [seeds, 2]
     gaps: NDArray[np.float64],  # [m] [seeds]
     moves: NDArray[np.int64],
     step: float,  # [m]
     limit: float,  # [m]
     last: tuple[int, int] = (-1, -1),  # Cells much farther than this one are left out.
+    buckets: int = _BUCKETS,  # More than the longest move has steps.
 ) -> NDArray[np.float64]:
     """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
     # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
@@ -55,7 +57,7 @@ def path_lengths(
     settled = np.zeros((nx, ny), np.bool_)
     lengths = _lengths(moves, step)
     # Lists of cells: the first of each bucket, and behind each entry the next.
-    heads = np.empty(_BUCKETS, np.int64)
+    heads = np.empty(buckets, np.int64)
     heads[:] = -1
     cells, nexts = np.empty(1024, np.int64), np.empty(1024, np.int64)
     entries, waiting = 0, 0
@@ -63,18 +65,18 @@ def path_lengths(
         i, j = seeds[k]
         if gaps[k] <= limit and gaps[k] < lengths_to[i, j]:
             lengths_to[i, j] = gaps[k]
-            bucket = int(gaps[k] / step) % _BUCKETS
+            bucket = int(gaps[k] / step) % buckets
             cells[entries], nexts[entries] = i * ny + j, heads[bucket]
             heads[bucket] = entries
             entries += 1
             waiting += 1
     bucket = 0
     while waiting > 0:
-        at = heads[bucket % _BUCKETS]
+        at = heads[bucket % buckets]
         if at < 0:
             bucket += 1
             continue
-        heads[bucket % _BUCKETS] = nexts[at]
+        heads[bucket % buckets] = nexts[at]
         waiting -= 1
         i, j = cells[at] // ny, cells[at] % ny
         if settled[i, j] or lengths_to[i, j] > limit:
@@ -91,16 +93,27 @@ def path_lengths(
             length = lengths_to[i, j] + lengths[k]
             if length > limit or length >= lengths_to[to_i, to_j]:
                 continue
-            over, under = (i + moves[k, 2], j + moves[k, 3]), (i + moves[k, 4], j + moves[k, 5])
-            if not (free[over] and free[under]):
+            length = lengths_to[i, j] + _factor(free, i, j, moves[k]) * lengths[k]
+            if length > limit or length >= lengths_to[to_i, to_j]:
                 continue
             lengths_to[to_i, to_j] = length
-            later = int(length / step) % _BUCKETS
+            later = int(length / step) % buckets
             cells[entries], nexts[entries] = to_i * ny + to_j, heads[later]
             heads[later] = entries
             entries += 1
             waiting += 1
     return lengths_to
+
+
+@njit
+def _factor(
+    free: NDArray[np.bool_] | NDArray[np.int64], i: int, j: int, move: NDArray[np.int64]
+) -> float:
+    """By how much longer a move from a cell counts; infinite if it cuts a corner."""
+    over, under = free[i + move[2], j + move[3]], free[i + move[4], j + move[5]]
+    if not (over and under):
+        return math.inf
+    return float(max(int(free[i, j]), int(free[i + move[0], j + move[1]]), int(over), int(under)))
 
 
 @njit

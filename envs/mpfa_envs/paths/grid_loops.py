@@ -216,7 +216,7 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit
 def interpolate(
-    values: NDArray[np.float32],  # [N, most columns, most rows]
+    values: NDArray[np.float32] | NDArray[np.float64],  # [N, most columns, most rows]
     number: int,  # of the grid
     nx: int,
     ny: int,

@@ -1,4 +1,4 @@
-"""Classic drivers: planners on the known map, and the dynamic window."""
+"""Classic drivers: planners on the known map, the dynamic window and predictive control."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from mpfa_envs.checks import did_you_mean
+from mpfa_envs.checks import check_choice, did_you_mean
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import MapPlanner
+from mpfa_envs.planners.predictive import PredictiveControl
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search, astar_path, dijkstra_path, path_length
 from mpfa_envs.robots.resolve import RobotChoice
@@ -20,6 +21,7 @@ __all__ = [
     "AntColony",
     "DynamicWindow",
     "MapPlanner",
+    "PredictiveControl",
     "PurePursuit",
     "Search",
     "WindowScore",
@@ -35,6 +37,7 @@ PLANNERS: Final[Mapping[str, str]] = MappingProxyType(
         "dijkstra": "Dijkstra on the known map, followed by pure pursuit",
         "ant_colony": "an ant colony on the known map, followed by pure pursuit",
         "dwa": "the dynamic window approach, which sees the observation alone",
+        "mpc": "sampling model predictive control, on a map of the robot's own",
     }
 )
 """The planners by name, each in a sentence."""
@@ -48,14 +51,15 @@ def make_planner(
     robot: RobotChoice = "turtlebot2",
     memory: Memory = "none",
     seed: int = 0,
-) -> MapPlanner | DynamicWindow:
+) -> MapPlanner | DynamicWindow | PredictiveControl:
     """Make a planner, which :func:`~mpfa_envs.evaluate` drives as it does a trained policy.
 
     Args:
         name: One of :data:`PLANNERS`.
         robot: What drives.
-        memory: Of the dynamic window: whether it sees the path on the robot's map.
-        seed: Of the ant colony.
+        memory: Of the dynamic window: whether it sees the path on the robot's map. Predictive
+            control always has the map.
+        seed: Of the ant colony, and of predictive control.
 
     Returns:
         The planner.
@@ -74,6 +78,9 @@ def make_planner(
         raise ValueError(f"name must be one of {sorted(PLANNERS)}, got {name!r}{hint}")
     if name == "dwa":
         return DynamicWindow(robot=robot, memory=memory)
+    if name == "mpc":
+        check_choice("memory", memory, Memory)
+        return PredictiveControl(robot=robot, seed=seed)
     if memory != "none":
         raise ValueError(f"memory must be 'none' for {name}, which knows the map, got {memory!r}")
     if name == "ant_colony":

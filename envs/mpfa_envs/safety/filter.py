@@ -112,7 +112,7 @@ class SafetyFilter:
         self._max_range = check_positive("max_range", max_range)
         self._near = check_positive("closeness_distance", closeness_distance)
         limits = self.robot.wheel_limits
-        self._body = Body(
+        self.body = Body(
             limits,
             self.robot.wheel_base,
             self.robot.radius,
@@ -122,13 +122,14 @@ class SafetyFilter:
             check_positive("braking", check_share("braking", braking)),
             limits if braking == 1.0 else limits._replace(turning=math.inf),
         )
-        reach = _reach(self._body) + math.hypot(*mount)
+        """Sizes, limits and time steps, as compiled loops read them."""
+        reach = _reach(self.body) + math.hypot(*mount)
         if self.robot.can_stop and reach > self._max_range:
             raise ValueError(
                 f"max_range must be at least {reach:.3g} m, within which {self.robot.name} "
                 f"decides and stops from its greatest speed, got {max_range}"
             )
-        self._candidates = _candidates(check_count("samples", samples, least=2), self._body)
+        self._candidates = _candidates(check_count("samples", samples, least=2), self.body)
 
     def __call__(
         self, observation: NDArray[np.float32], action: NDArray[np.float32]
@@ -184,13 +185,29 @@ class SafetyFilter:
             self._origins,
             self._wheel_speeds(rows).reshape(len(actions), -1, 2),
             self._candidates,
-            self._body,
+            self.body,
             chosen,
         )
         changed = (chosen != actions).any(axis=1)
         kept = wanted.reshape(-1, 2).copy()
         kept[changed] = chosen[changed]
         return kept.reshape(wanted.shape)
+
+    def seen(
+        self, observations: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """What a robot may meet, and how its wheels turn, as compiled loops read it.
+
+        Args:
+            observations: Observations in each of the states that it may be in, ``[S, O]``.
+
+        Returns:
+            Ranges of the rays [m], ``[S, R]``, infinite where they hit nothing; their directions,
+            cosine and sine, and origins (x, y) in the robot's frame [m], ``[2, R]``; and the speeds
+            of the wheels [m/s], ``[S, 2]``.
+        """
+        rows = np.asarray(observations, dtype=np.float64)
+        return self._ranges(rows), self._directions, self._origins, self._wheel_speeds(rows)
 
     def _ranges(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Ranges of all rays [m], ``[N, R]``: each may be the one that its sector reports."""

@@ -79,12 +79,10 @@ def filter_actions(
     for robot in range(actions.shape[0]):
         _choose(chosen, robot, actions, robot)
         seen = ranges[robot], directions, origins, speeds[robot]
-        _see(seen, body, 0.0, points, counts)
-        # Real wheels creep while they are told to stand: what has come too near is left.
-        nearest = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius)
-        farther = nearest + _GAIN
-        wants = farther if farther - body.radius < _LEAST * body.clearance else -1.0
-        room = _room_after(wanted[robot], speeds[robot], points, counts, body)
+        see(seen, body, 0.0, points, counts)
+        farther = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius) + _GAIN
+        wants = least_room(points[0, : counts[0]], body)
+        room = room_after(wanted[robot], speeds[robot], points, counts, body)
         if room > wants:
             continue
         admissible = room > -1.0
@@ -105,7 +103,7 @@ def filter_actions(
             chosen[robot, 0], chosen[robot, 1] = -side, side
         order = np.argsort(gaps)
         for k in order:
-            room = _room_after(commands[k], speeds[robot], points, counts, body)
+            room = room_after(commands[k], speeds[robot], points, counts, body)
             if room > wants or (not admissible and room > -1.0):
                 _choose(chosen, robot, candidates, k)
                 admissible = True
@@ -113,9 +111,9 @@ def filter_actions(
                 break
         if room > wants:
             continue
-        _see(seen, body, _CREEP, points, counts)
+        see(seen, body, _CREEP, points, counts)
         for k in order:
-            if _room_after(commands[k], speeds[robot], points, counts, body) > farther:
+            if room_after(commands[k], speeds[robot], points, counts, body) > farther:
                 _choose(chosen, robot, candidates, k)
                 break
 
@@ -129,7 +127,15 @@ def _choose(
 
 
 @njit
-def _see(
+def least_room(points: NDArray[np.float64], body: Body) -> float:
+    """Distance of a point that an action must exceed once the robot stands [m]; -1 if any does."""
+    # Real wheels creep while they are told to stand: what has come too near is left.
+    farther = _nearest(0.0, 0.0, points, body.radius) + _GAIN
+    return farther if farther - body.radius < _LEAST * body.clearance else -1.0
+
+
+@njit
+def see(
     # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
     seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     body: Body,
@@ -186,7 +192,7 @@ def _near_points(
 
 
 @njit
-def _room_after(
+def room_after(
     command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
     speeds: NDArray[np.float64],  # in each state [m/s], [S, 2]
     points: NDArray[np.float64],  # [S, R, 3]
