@@ -331,7 +331,7 @@ def test_a_planner_plans_in_the_world_that_it_is_in() -> None:
 def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = itertools.count()
     monkeypatch.setattr(
-        "mpfa_envs.evaluation.runs.time", SimpleNamespace(perf_counter=ticks.__next__)
+        "mpfa_envs.evaluation.runs.time", SimpleNamespace(process_time=ticks.__next__)
     )
     results = run_tasks(
         as_driver(lambda seen: np.ones((len(seen), 2))),

@@ -40,10 +40,10 @@ class EpisodeResult:
     sct: float
     """Success weighted by completion time, see :func:`sct`."""
     plan_s: float = field(default=0.0, compare=False)
-    """Wall-clock time of planning before the first action [s]. Results that differ in times of the
+    """CPU time of planning before the first action [s]. Results that differ in times of the
     machine alone are equal."""
     decision_s: float = field(default=0.0, compare=False)
-    """Mean wall-clock time of an action [s]; its share where several robots act together."""
+    """Mean CPU time of an action [s]; its share where several robots act together."""
     world: str = ""
     """Name of the world."""
     walker_distance: float | None = None

@@ -327,15 +327,15 @@ def _drive(
             observations = _begin(env, tasks, at_work, begun)
             decided[begun], decisions[begun] = 0.0, 0
         for robot in np.flatnonzero(begun).tolist():
-            start = time.perf_counter()
+            start = time.process_time()
             driver.begin(env, robot)
-            planned[robot] = time.perf_counter() - start
+            planned[robot] = time.process_time() - start
         running = at_work >= 0
         robots = np.flatnonzero(running)
         actions = np.zeros((env.num_envs, 2), np.float32)
-        start = time.perf_counter()
+        start = time.process_time()
         actions[running] = driver.drive(env, robots, observations[running])
-        decided[running] += (time.perf_counter() - start) / len(robots)
+        decided[running] += (time.process_time() - start) / len(robots)
         decisions[running] += 1
         observations, _, terminated, truncated, info = env.step(actions, only=running)
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
