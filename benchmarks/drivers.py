@@ -4,7 +4,8 @@
     python -m benchmarks.drivers docs/results/rooms/drivers.csv    the tables of kept rows
 
 Takes what ``compare.py`` and ``evaluate.py`` wrote in the folder, however deep. A row is a driver,
-a seed and a kind of worlds.
+a seed, a condition and a kind of worlds. Time is that over the *bound*: the task's shortest path at
+the robot's full speed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import pandas as pd
 
 from mpfa_envs import POLICIES, load_policy
 from mpfa_envs.policies.files import policy_file
-from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
@@ -29,14 +29,13 @@ from training.records import read_table
 from training.worlds import family
 
 _DRIVER = ["robot", "driver", "filter"]
-_COUNTED = ["success", "collision", "timeout"]
+_ENDS = ["collision", "standstill", "timeout"]
 _NAMES = {
     **{"dwa": "`dwa`", "dwa map": "`dwa --memory map`", "ddpg": "DDPG", "td3": "TD3"},
     "mpc known": "`mpc --plan known`",
 }
-_REFERENCE = "dwa map"
-"""Driver whose times others are divided by, of the same robot."""
-_TASK = ["world", "episode"]
+_ERRORS = ("range_noise", "dropout", "slip", "drift")
+_MAZES = "mazes:test"
 
 
 def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
@@ -46,93 +45,127 @@ def evaluations_of(folder: Path) -> Iterator[tuple[dict[str, Any], pd.DataFrame]
         if "words" not in asked:  # Episodes of a training.
             continue
         run = read_json(path.parents[1] / files.SETTINGS)
-        named = ("policy", "memory", "plan") if "policy" in asked else ()
-        planner = " ".join(asked[name] for name in named if asked.get(name, "none") != "none")
         driver = {
-            "robot": resolve_robot(asked.get("robot") or _trained_with(asked, run)),
-            "driver": planner or asked["card"]["learner"],
+            "robot": resolve_robot(asked.get("robot") or _trained_with(asked, run)).name,
+            "driver": _driver_of(asked, run),
             "seed": asked.get("card", asked)["seed"],
             "filter": "filter" in asked,
+            "condition": _condition(asked),
         }
         yield driver, read_table(path)
+
+
+def _driver_of(asked: Mapping[str, Any], run: Mapping[str, Any]) -> str:
+    """Name a planner with its options, a policy of the package, or the learner of a run."""
+    if "policy" in asked:
+        options = (asked[name] for name in ("policy", "memory", "plan") if name in asked)
+        return " ".join(option for option in options if option not in ("none", "unknown"))
+    return str(asked["card"]["learner"]) if run else _packaged(asked)
+
+
+def _packaged(asked: Mapping[str, Any]) -> str:
+    """Return the name of the package's policy that an evaluation drove."""
+    [name] = [name for name in POLICIES if files.digest(policy_file(name)) == asked["sha256"]]
+    return name
 
 
 def _trained_with(asked: Mapping[str, Any], run: Mapping[str, Any]) -> RobotChoice:
     """The robot of an evaluation's policy: that of its run, or of a policy in the package."""
     if run:
         return run["environment"]["robot"]
-    [name] = [name for name in POLICIES if files.digest(policy_file(name)) == asked["sha256"]]
-    return load_policy(name).env_arguments["robot"]
+    return load_policy(_packaged(asked)).env_arguments["robot"]
+
+
+def _condition(asked: Mapping[str, Any]) -> str:
+    """Name errors and delay of an evaluation; ``clean`` for none."""
+    errors = asked.get("noise", {})
+    named = [f"{name} {errors[name]:g}" for name in _ERRORS if errors.get(name)]
+    if asked.get("latency"):
+        named.append(f"{asked['latency']:g} s late")
+    return ", ".join(named) or "clean"
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:
     """Make the rows of all evaluations in a folder."""
-    found = list(evaluations_of(folder))
-    # With the filter, where both ways were driven.
-    references = {
-        driver["robot"]: episodes[episodes["success"]].set_index(_TASK)["time_s"]
-        for driver, episodes in sorted(found, key=lambda each: each[0]["filter"])
-        if driver["driver"] == _REFERENCE
-    }
     return [
-        {
-            **driver,
-            "robot": driver["robot"].name,
-            "worlds": kind,
-            "episodes": len(each),
-            **each[[*_COUNTED, "spl", "sct"]].astype(float).mean(),
-            "time_s": each.loc[each["success"], "time_s"].mean(),
-            **_beside(each, references.get(driver["robot"]), driver["robot"]),
-        }
-        for driver, episodes in found
-        for kind, each in episodes.groupby(episodes["world"].map(family), sort=False)
+        {**driver, "worlds": kind, **_row(group)}
+        for driver, episodes in evaluations_of(folder)
+        for kind, group in episodes.groupby(episodes["world"].map(family), sort=False)
     ]
 
 
-def _beside(
-    episodes: pd.DataFrame, reference: pd.Series | None, robot: RobotModel
-) -> dict[str, float]:
-    """Divide times, and those of the driven paths at full speed, by the reference's times.
-
-    Over the tasks that both reach.
-    """
-    if reference is None:
-        return {}
-    reached = episodes[episodes["success"]].set_index(_TASK)
-    both = reached.join(reference.rename("reference"), how="inner")
-    time, bound = both["time_s"].sum(), both["path_length"].sum() / robot.max_wheel_speed
-    least = both["reference"].sum()
-    return {"time_ratio": time / least, "bound_ratio": bound / least} if len(both) else {}
+def _row(episodes: pd.DataFrame) -> dict[str, float]:
+    """Rates and means of episodes in a kind of worlds; a standstill is no other timeout."""
+    reached = episodes[episodes["success"]]
+    return {
+        "episodes": len(episodes),
+        "success": episodes["success"].mean(),
+        "collision": episodes["collision"].mean(),
+        "standstill": episodes["standstill"].mean(),
+        "timeout": (episodes["timeout"] & ~episodes["standstill"]).mean(),
+        "spl": episodes["spl"].mean(),
+        "time_s": reached["time_s"].mean(),
+        # SCT of a success is the least time over the time.
+        "time_over_bound": float(np.exp(-np.log(reached["sct"]).mean())),
+        "decision_ms": 1000.0 * episodes["decision_s"].mean(),
+    }
 
 
 def tables_of(rows: pd.DataFrame) -> str:
-    """Write Markdown tables of success, of paths and times, and of times beside the reference."""
-    kinds = rows["worlds"].unique()
-    success, paths, beside = [], [], []
-    for _, runs in rows.groupby(_DRIVER, sort=False):
-        robot, driver, filtered = runs[_DRIVER].iloc[0]
-        cells = [f"`{robot}`", _NAMES.get(driver, f"`{driver}`"), "yes" if filtered else "no"]
-        of = {kind: runs[runs["worlds"] == kind] for kind in kinds}
-        rate = (runs["collision"] * runs["episodes"]).sum() / runs["episodes"].sum()
-        success.append([*cells, *(_lowest(of[kind]["success"]) for kind in kinds), f"{rate:.2%}"])
-        path = (f"{of[kind]['spl'].mean():.3f}, {of[kind]['time_s'].mean():.1f}" for kind in kinds)
-        paths.append([*cells, *path])
-        if "time_ratio" in runs and runs["time_ratio"].notna().all():
-            generated = runs[runs["worlds"].str.contains(":")]
-            each = [*(of[kind] for kind in kinds), generated]
-            beside.append([*cells, *map(_ratios, each)])
+    """Write Markdown tables of success, of paths and times, and of errors and delays."""
+    clean = rows[rows["condition"] == "clean"]
+    kinds = clean["worlds"].unique()
+    success, spl, times = [], [], []
+    for _, runs in clean.groupby(_DRIVER, sort=False):
+        cells = [*_cells(runs), "yes" if runs["filter"].iloc[0] else "no"]
+        of = [runs[runs["worlds"] == kind] for kind in kinds]
+        ends = (f"{_rate(runs, end):.2%}" for end in _ENDS)
+        success.append([*cells, *(_lowest(each["success"]) for each in of), *ends])
+        decision = runs["decision_ms"].mean()
+        spl.append([*cells, *(f"{each['spl'].mean():.3f}" for each in of), f"{decision:.2f}"])
+        generated = runs[runs["worlds"].str.contains(":")]
+        times.append([*cells, *(f"{_over_bound(each):.3f}" for each in [*of, generated])])
     heads = ["robot", "driver", "filter", *kinds]
-    tables = [table([*heads, "collisions"], success), table(heads, paths)]
-    if beside:
-        tables.append(table([*heads, "generators"], beside))
+    tables = [
+        table([*heads, "collisions", "stand-stills", "other timeouts"], success),
+        table([*heads, "CPU time of a decision [ms]"], spl),
+        table([*heads, "generators"], times),
+    ]
+    if len(clean) < len(rows):
+        tables.append(_table_of_conditions(rows))
     return "\n\n".join(tables)
 
 
-def _ratios(runs: pd.DataFrame) -> str:
-    """Write the times and their bounds beside the reference: geometric means over kinds."""
-    means = runs.groupby("worlds")[["time_ratio", "bound_ratio"]].mean()
-    time, bound = np.exp(np.log(means).mean())
-    return f"{time:.3f} ({bound:.2f})"
+def _table_of_conditions(rows: pd.DataFrame) -> str:
+    """Write success, collisions and time over the bound with errors and delays."""
+    lines = []
+    for (_, _, condition), runs in rows.groupby(["robot", "driver", "condition"], sort=False):
+        if condition == "clean":
+            continue
+        mazes = runs["worlds"] == _MAZES
+        cells = [*_cells(runs), str(condition)]
+        for part in (runs[~mazes], runs[mazes]):
+            rates = f"{_rate(part, 'success'):.1%}, {_rate(part, 'collision'):.1%}"
+            cells.append(f"{rates}, {_over_bound(part):.2f}")
+        lines.append(cells)
+    return table(["robot", "driver", "condition", "five kinds", _MAZES], lines)
+
+
+def _cells(runs: pd.DataFrame) -> list[str]:
+    """Name the robot and the driver of rows."""
+    robot, driver = runs[["robot", "driver"]].iloc[0]
+    return [f"`{robot}`", _NAMES.get(driver, f"`{driver}`")]
+
+
+def _rate(runs: pd.DataFrame, end: str) -> float:
+    """Share of all episodes that end so."""
+    return float((runs[end] * runs["episodes"]).sum() / runs["episodes"].sum())
+
+
+def _over_bound(runs: pd.DataFrame) -> float:
+    """Geometric mean over kinds of the time over the bound."""
+    means = np.log(runs["time_over_bound"]).groupby(runs["worlds"]).mean()
+    return float(np.exp(means.mean()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
