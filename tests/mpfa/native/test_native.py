@@ -35,8 +35,10 @@ ONE = torch.ones(1, dtype=torch.double)
 
 
 @pytest.fixture(autouse=True)
-def own_library():
-    """The next test looks for the loops again."""
+def own_library(monkeypatch):
+    """Each test chooses its path, and the next one looks for the loops again."""
+    monkeypatch.delenv("TORCHRL_MPFA_NATIVE", raising=False)
+    native.find_loops.cache_clear()
     yield
     native.find_loops.cache_clear()
 
