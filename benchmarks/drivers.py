@@ -107,7 +107,8 @@ def _row(episodes: pd.DataFrame) -> dict[str, float]:
         "time_s": reached["time_s"].mean(),
         # SCT of a success is the least time over the time.
         "time_over_bound": float(np.exp(-np.log(reached["sct"]).mean())),
-        "decision_ms": 1000.0 * episodes["decision_s"].mean(),
+        # The first decisions of a process load what is compiled.
+        "decision_ms": 1000.0 * episodes["decision_s"].median(),
     }
 
 
@@ -121,7 +122,7 @@ def tables_of(rows: pd.DataFrame) -> str:
         of = [runs[runs["worlds"] == kind] for kind in kinds]
         ends = (f"{_rate(runs, end):.2%}" for end in _ENDS)
         success.append([*cells, *(_lowest(each["success"]) for each in of), *ends])
-        decision = runs["decision_ms"].mean()
+        decision = runs["decision_ms"].median()
         spl.append([*cells, *(f"{each['spl'].mean():.3f}" for each in of), f"{decision:.2f}"])
         generated = runs[runs["worlds"].str.contains(":")]
         times.append([*cells, *(f"{_over_bound(each):.3f}" for each in [*of, generated])])

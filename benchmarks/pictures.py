@@ -117,6 +117,33 @@ def methods(output: Path) -> None:
     save(picture, output / "methods.png")
 
 
+def planners(output: Path) -> None:
+    """Paths of a policy and of two planners to the goal of one maze, on simulated wheels."""
+    of_robot: dict[str, Any] = {"robot": "kobuki"}
+    drivers = {
+        SHIPPED: filtered(load_policy(SHIPPED)),
+        "mpc": filtered(make_planner("mpc", **of_robot)),
+        "dwa --memory map": filtered(make_planner("dwa", memory="map", **of_robot)),
+    }
+    how = {**_HOW, "physics": "wheels"}
+    driven = {name: drive(each, [MAZE], episodes=20, **how)[0] for name, each in drivers.items()}
+    lengths = [result.shortest_path for result in driven[SHIPPED].results]
+    fitting = [number for number, length in enumerate(lengths) if length <= _LONGEST]
+    task = max(fitting, key=lengths.__getitem__)
+    titled = {
+        f"{name}, {drives.results[task].time_s:.0f} s": drives for name, drives in driven.items()
+    }
+    picture = render_methods(
+        driven[SHIPPED].tasks[task].world,
+        {name: [each.trails[task]] for name, each in titled.items()},
+        [driven[SHIPPED].tasks[task].task.goal],
+        {name: [each.results[task].outcome] for name, each in titled.items()},
+        columns=3,
+        size=_TILE,
+    )
+    save(picture, output / "planners.png")
+
+
 def filmed(driver: Drivable) -> tuple[int, WorldTask]:
     """Number and task of the animation: of twenty in mazes the longest that fits in one look."""
     return longest(drive(driver, [MAZE], episodes=20, **_HOW), most=_LONGEST)
@@ -224,7 +251,7 @@ OF_RUN: dict[str, Callable[[Run, Path], None]] = {
     each.__name__: each for each in (values, samples, histograms)
 }
 OTHERS: dict[str, Callable[[Path], None]] = {
-    each.__name__: each for each in (episode, navigation, curves, rooms, methods)
+    each.__name__: each for each in (episode, navigation, curves, rooms, methods, planners)
 }
 
 
