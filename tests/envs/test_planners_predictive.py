@@ -112,6 +112,15 @@ def test_a_plan_costs_its_time_and_that_from_its_end() -> None:
     assert rollout(straight(0.7), scene(speed=0.7), BODY, EFFORT, 12.0) == math.inf
 
 
+@pytest.mark.parametrize(("room", "more"), [(0.5 * ROOMY, 0.25), (-0.01, 1.0)])
+def test_time_near_obstacles_costs_more_also_where_the_robot_begins_too_near(
+    room: float, more: float
+) -> None:
+    free = rollout(straight(0.7), scene(speed=0.7), BODY, EFFORT, math.inf)
+    near = scene(speed=0.7)._replace(rooms=np.full((1, 121, 121), room))
+    assert rollout(straight(0.7), near, BODY, EFFORT, math.inf) == pytest.approx(free + 1.6 * more)
+
+
 def test_a_plan_must_be_able_to_stop_after_its_end() -> None:
     # 1.12 m, 0.27 m to brake in time steps, and 0.21 m of rim and clearance.
     assert rollout(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
