@@ -6,7 +6,6 @@
     python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
     python examples/train.py regime=paper curriculum=A    only world A
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep, in hydra.sweep.dir
-    python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
     python examples/train.py settings=runs/tune/best.yaml    a file of settings; these words win
     python examples/train.py plugin=mine.py method=mine    a method of your own
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    resume a run that was stopped

@@ -18,7 +18,6 @@ from benchmarks.speed import (
     replay,
     run,
     sbx_peer,
-    scaling,
     start,
     timing,
     training,
@@ -27,7 +26,6 @@ from benchmarks.speed import (
 )
 from benchmarks.speed.timing import Entry, Timing, entry
 from torchrl_mpfa.methods import METHODS
-from training.settings.train import register
 
 
 def check_schema(entries: Sequence[Entry]) -> None:
@@ -229,13 +227,3 @@ def test_robots_among_walkers_are_compared_with_robots_alone(
     assert found["vector_walkers"]["ratio"] == pytest.approx(1.5)
     assert found["vector_walkers"]["value"] == pytest.approx(vector.ROBOTS / 3.0)
     assert found["vector_kinematic"]["ratio"] is None
-
-
-@pytest.mark.slow
-def test_a_run_is_measured_once_it_updates() -> None:
-    register()
-    tiny = ["learner.width=8", "method.batch_size=32", "exploration.random_steps=16"]
-    actions, updates = scaling.measure(["robots=8", "updates=2", *tiny], seconds=0.2)
-    assert actions > 0
-    # Two updates for eight actions, whatever the time.
-    assert updates == pytest.approx(actions / 4)

@@ -29,7 +29,7 @@ import torchrl_trainer
 import tune
 from benchmarks import drivers, pictures, sampling, stops
 from benchmarks.paper import __main__ as paper
-from benchmarks.speed import environment, scaling, worlds
+from benchmarks.speed import environment, worlds
 from benchmarks.values import __main__ as values
 from torchrl_mpfa.methods import METHODS, Scaled
 from training.plugins import with_plugin
@@ -65,7 +65,6 @@ MAINS: dict[str, Callable[[], object]] = {
     "torchrl_trainer": torchrl_trainer.main,
     "tune": tune.main,
     "benchmarks.speed.environment": environment.main,
-    "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
     "benchmarks.values": values.main,
     "benchmarks.paper": paper.main,

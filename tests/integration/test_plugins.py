@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -193,18 +191,3 @@ def test_a_signal_of_another_shape_is_rejected_by_name(mine: Path) -> None:
         own.write(None, TensorDict({"x": torch.zeros(8)}, [8]))
     with pytest.raises(TypeError, match="signal must be a function or a class, got 3"):
         register_signal("three", 3)  # type: ignore[arg-type]
-
-
-@pytest.mark.slow
-def test_processes_of_ray_load_the_plugin(mine: Path, tmp_path: Path) -> None:
-    pytest.importorskip("ray")
-    words = [*tiny_run(mine), "ray.workers=2", "robots=4", "ray.steps=4", f"run_dir={tmp_path}/run"]
-    done = subprocess.run(
-        [sys.executable, train.__file__ or "", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "TQDM_DISABLE": "1"},
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert (tmp_path / "run" / files.POLICY).exists()

@@ -26,7 +26,7 @@ from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings, as_settings
 
 SCRIPTS = Path(__file__).resolve().parents[2]
-_OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
+_OF_THE_RESULT = ("evaluation.every",)
 """Settings that a resumed run may change, but that change its result."""
 _FREE = {*LAWFUL, *OF_THE_CALL, "device", "threads"} - {*_OF_THE_RESULT}
 """Settings that may differ from those that a comparison asks for."""

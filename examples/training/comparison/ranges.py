@@ -30,7 +30,6 @@ _ALIKE = (
     "curriculum",
     "regime",
     "tracking",
-    "ray",
     "device",
     "threads",
 )

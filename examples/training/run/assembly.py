@@ -26,7 +26,6 @@ from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor
 from torchrl_mpfa.networks.deterministic import ValueNetwork
-from training.run.driving import Robots
 from training.run.q_learning import TabularQLearner, ValueTable, make_value_table
 from training.settings.learners import LearnerSettings, is_discrete
 from training.settings.train import TrainSettings
@@ -158,12 +157,3 @@ def make_curiosity(
         return None
     made = Curiosity(observation_size, action_size, scale=method.curiosity)
     return made.to(device)
-
-
-def make_robots(settings: TrainSettings) -> Robots:
-    """The robots of a run, in this process or on a Ray cluster."""
-    if not settings.ray.workers:
-        return Robots(settings)
-    from training.run.fleet import Fleet
-
-    return Fleet(settings)

@@ -13,7 +13,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_mpfa.methods import Method, Replay, make_replay
 from training.environments import (
     INFO,
     FilteredRobots,
@@ -57,16 +56,11 @@ class Robots:
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
-        self._everyone = torch.arange(self.count)
         self._rewards = torch.zeros(self.count, dtype=torch.double)
         self._steps = torch.zeros(self.count, dtype=torch.long)
         self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
         """Number of the episode that each robot is in."""
         self._begun = 0
-
-    def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
-        """Make the buffer of the transitions, and the selection of batches from it."""
-        return make_replay(method, generator=torch.Generator().manual_seed(seed), **policy)
 
     def environment(self, world: str) -> EnvBase:
         """The environment of a stage, kept for as long as its world stays the same."""
@@ -86,15 +80,11 @@ class Robots:
         """Begin an episode with each robot; episodes in progress are given up."""
         env = self.environment(world)
         env.set_seed(seed)
-        self._give_up(explorer)
-        self._state = env.reset()
-
-    def _give_up(self, explorer: Explorer) -> None:
-        """Count the episodes in progress as given up, and number new ones."""
         self.given_up += int((self._steps > 0).sum())
         self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
         self._rewards.zero_()
         self._steps.zero_()
+        self._state = env.reset()
 
     def _begin_episodes(self, begun: Tensor, explorer: Explorer) -> None:
         """Number the episodes that begin, and signal them to the explorer."""
@@ -127,36 +117,24 @@ class Robots:
         if "episode" in entries:
             state.set("episode", self._numbers.clone())
         total = actions + self.count
-        records = self._note(
-            state["next"], self._everyone, explorer, episode=episode, total_steps=total
-        )
+        records = self._note(state["next"], explorer, episode=episode, total_steps=total)
         return state.select(*TRANSITION, *entries), records
 
     def _note(
-        self,
-        after: TensorDictBase,
-        robots: Tensor,
-        explorer: Explorer,
-        *,
-        episode: int,
-        total_steps: int,
+        self, after: TensorDictBase, explorer: Explorer, *, episode: int, total_steps: int
     ) -> list[EpisodeRecord]:
-        """Count an action of some robots; return the records of the episodes that ended."""
-        self._rewards[robots] += after["reward"].squeeze(-1)
-        self._steps[robots] += 1
+        """Count an action of each robot; return the records of the episodes that ended."""
+        self._rewards += after["reward"].squeeze(-1)
+        self._steps += 1
         done = after["done"].squeeze(-1)
-        records: list[EpisodeRecord] = []
-        ended = robots[done]
-        if len(ended):
-            for row in done.nonzero().squeeze(-1).tolist():
-                robot, number = int(robots[row]), episode + len(records)
-                record = self._record(after[row], robot, episode=number, total_steps=total_steps)
-                records.append(record)
-            begun = torch.zeros(self.count, dtype=torch.bool)
-            begun[ended] = True
-            self._begin_episodes(begun, explorer)
-            self._rewards[ended] = 0.0
-            self._steps[ended] = 0
+        records = [
+            self._record(after[robot], robot, episode=episode + number, total_steps=total_steps)
+            for number, robot in enumerate(done.nonzero().squeeze(-1).tolist())
+        ]
+        if records:
+            self._begin_episodes(done, explorer)
+            self._rewards[done] = 0.0
+            self._steps[done] = 0
         return records
 
     @torch.no_grad()
@@ -206,12 +184,6 @@ class Robots:
             "environment": _as_tensors(vector_of(self._env).state_dict()),
             "observation": observation.clone(),
             "hindsight": None if hindsight is None else hindsight.clone(),
-            **self._counts(),
-        }
-
-    def _counts(self) -> dict[str, Any]:
-        """Return what counts for the whole run, and which episodes are in progress."""
-        return {
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
             "numbers": self._numbers.clone(),
@@ -227,10 +199,6 @@ class Robots:
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
         if "numbers" in state:
             self._numbers, self._begun = state["numbers"].clone(), state["begun"]
-
-    def can_go_on(self, state: dict[str, Any]) -> bool:
-        """Return True if a state has the places of the robots; else episodes must begin again."""
-        return state["environment"] is not None
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
         """Restore a state of :meth:`state_dict`."""

@@ -35,9 +35,6 @@ class Explorer:
         """Return actions, shape ``[N, A]``, for observations, shape ``[N, O]``."""
         raise NotImplementedError
 
-    def move_to(self, steps: int) -> None:
-        """Set the noise to its size after a number of actions."""
-
     def behavior(self) -> tuple[Tensor, Tensor]:
         """Return mean, ``[N, A]``, and standard deviation, ``[N, 1]``, of the last actions.
 
@@ -81,10 +78,8 @@ class SharedNoise(Explorer):
         return {"shares": self.shares.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the shares; another number of robots begins episodes with new shares."""
-        shares = state_dict["shares"].reshape(-1, 1)
-        if shares.shape == self.shares.shape:
-            self.shares.copy_(shares)
+        """Restore the shares of the episodes."""
+        self.shares.copy_(state_dict["shares"])
 
 
 class NoisyPolicy(SharedNoise):
@@ -122,11 +117,6 @@ class NoisyPolicy(SharedNoise):
         self.noise.step(len(observation))
         action: Tensor = chosen.lerp(noisy, self.shares.to(chosen.device))
         return action
-
-    def move_to(self, steps: int) -> None:
-        """Set the noise to its size after a number of actions."""
-        start, end = float(self.noise.sigma_init), float(self.noise.sigma_end)
-        self.noise.sigma.fill_(self.falling(start, end, steps))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the noise, and the shares of the episodes."""
@@ -168,10 +158,6 @@ class EpsilonGreedy(SharedNoise):
         at_random = torch.rand(len(best), 1) < self.epsilon * self.shares
         self.steps += len(best)
         return torch.where(at_random.to(best.device), chosen, best)
-
-    def move_to(self, steps: int) -> None:
-        """Set the chance to its size after a number of actions."""
-        self.steps = steps
 
     def state_dict(self) -> dict[str, Any]:
         """Return how far the chance has fallen, and the shares of the episodes."""

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from mpfa_envs import GoalRelabeling
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import Stop, run_updates
-from torchrl_mpfa.methods import OwnSignals
+from torchrl_mpfa.methods import OwnSignals, make_replay
 from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
@@ -28,7 +28,7 @@ from training.evaluating import Drives
 from training.files import no_room
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import showing
-from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
+from training.run.assembly import make_curiosity, make_learner, method_of
 from training.run.checkpoints import (
     Checkpoints,
     is_sound,
@@ -37,6 +37,7 @@ from training.run.checkpoints import (
     set_random_state,
 )
 from training.run.compiling import is_compiled
+from training.run.driving import Robots
 from training.run.evaluations import evaluate_policy
 from training.run.exploration import make_explorer
 from training.run.hooks import Hook, Progress
@@ -80,7 +81,7 @@ class TrainingRun:
         self.schedule = Schedule(settings.curriculum.stages)
         self.stop = Stop(write=tqdm.write)
         torch.manual_seed(settings.seed)
-        self.robots = make_robots(settings)
+        self.robots = Robots(settings)
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
@@ -123,9 +124,9 @@ class TrainingRun:
         self.signals = OwnSignals(learned_signals(method))
         self.curiosity = make_curiosity(method, *sizes, device=device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
-        replay = self.robots.make_replay(
+        replay = make_replay(
             method,
-            seed=settings.seed,
+            generator=torch.Generator().manual_seed(settings.seed),
             policy=self.learner.policy,
             sigma=lambda: self.explorer.sigma,
         )
@@ -141,8 +142,8 @@ class TrainingRun:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
             self.buffer.append_transform(self._task.make_mirror(pairs=pairs))
 
-    def _begin_stage(self, *, again: int = 0) -> None:
-        seed = self.settings.seed * 1_000_003 + self.schedule.stage + again
+    def _begin_stage(self) -> None:
+        seed = self.settings.seed * 1_000_003 + self.schedule.stage
         # However many random numbers the parts were made of, the robots explore alike.
         torch.manual_seed(seed)
         self.robots.begin(self.schedule.world, self.explorer, seed=seed)
@@ -192,10 +193,7 @@ class TrainingRun:
             episode=self.schedule.episodes,
             entries=self.entries,
         )
-        # Robots on other machines have written theirs.
-        slots = rows.get("slot", None)
-        slots = self.buffer.extend(rows) if slots is None else slots
-        self.log.wrote(slots, rows["next", "reward"])
+        self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
         self.records += records
         self.schedule.count(actions=len(rows), episodes=len(records))
         if len(self.buffer) >= (self.buffer.batch_size or 0):
@@ -232,10 +230,6 @@ class TrainingRun:
         if not due or not self.crossed(self.settings.method.update_block):
             return
         every, begun = self.settings.tracking.log_every, self.actions - self.waiting
-        updates = self.settings.updates
-        if self.settings.ray.workers:
-            # A call to another process costs as much as an update: one for all that are due.
-            due, updates = 1, due * updates
         if self._to_compile:
             self._to_compile = False
             tqdm.write("compiling the update, some 20 s, or a few if that was done before")
@@ -244,10 +238,10 @@ class TrainingRun:
                 self.buffer,
                 self.learner,
                 self.select,
-                updates=updates,
+                updates=self.settings.updates,
                 prepare=self._prepared,
             )
-            self.updates += updates
+            self.updates += self.settings.updates
         self.waiting = left
         self.log.learned(losses)
         if every > 0 and begun // every != self.actions // every:
@@ -299,13 +293,9 @@ class TrainingRun:
     def _resume(self, robots: dict[str, Any], random: Any) -> None:
         """Restore the robots, or begin the next stage if it is due."""
         self.robots.recall(robots)
-        if self._advance():
-            pass
-        elif self.robots.can_go_on(robots):
+        if not self._advance():
             self.robots.load_state_dict(self.schedule.world, robots)
             set_random_state(self.settings.device, random)
-        else:
-            self._begin_stage(again=self.actions)
         self._anneal()
 
     def close(self) -> None:

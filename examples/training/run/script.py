@@ -302,8 +302,4 @@ def outside_cause(error: Exception) -> str | None:
         )
     if (full := files.full_disk(error)) is not None:
         return full
-    kinds = {kind.__name__ for kind in type(error).__mro__}
-    # By name, as Ray is an extra; its RayTaskError is an error in what a worker did.
-    if "RayError" in kinds and "RayTaskError" not in kinds:
-        return f"the Ray cluster has lost what the run needs: {said}"
     return None

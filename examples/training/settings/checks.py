@@ -44,7 +44,6 @@ def check_settings(settings: TrainSettings) -> None:
     _check_stages(settings)
     _check_evaluation(settings)
     _check_method(settings.method)
-    _check_ray(settings)
     if is_discrete(settings.learner):
         _check_discrete(settings)
     _check_device(settings.device)
@@ -121,31 +120,6 @@ def _check_method(method: Method) -> None:
         raise ValueError(
             f"method.capacity must hold a batch of {method.rows}, got {method.capacity}: it would "
             "never learn"
-        )
-
-
-def _check_ray(settings: TrainSettings) -> None:
-    """Raise if the robots, or the buffer, must be in the process that learns."""
-    workers = settings.ray.workers
-    if not workers:
-        return
-    if find_spec("ray") is None:
-        raise ValueError(
-            f"ray.workers={workers} needs Ray: install the extra 'ray', see Install in the README"
-        )
-    if settings.robots % workers:
-        raise ValueError(
-            f"robots must be a multiple of ray.workers={workers}, got {settings.robots}"
-        )
-    if not settings.method.remote:
-        raise ValueError(
-            f"ray.workers must be 0 with method={settings.method.name}, got {workers}: its buffer "
-            "must be in the process that learns"
-        )
-    if settings.method.update_block != 1:
-        raise ValueError(
-            f"method.update_block must be 1 with ray.workers={workers}, got "
-            f"{settings.method.update_block}"
         )
 
 

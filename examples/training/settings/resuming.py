@@ -35,10 +35,6 @@ LAWFUL = (
     "tracking.group",
     "tracking.log_every",
     "tracking.pictures_every",
-    "ray.workers",
-    "ray.address",
-    "ray.steps",
-    "ray.sync",
 )
 """Settings that a resumed run may change; its episodes may become more, too."""
 OF_THE_CALL = ("resume", "run_dir", "overwrite")

@@ -190,22 +190,6 @@ class TrackingSettings:
 
 
 @dataclass
-class RaySettings:
-    """Processes of the robots; see ``docs/scaling.md``."""
-
-    workers: int = setting(0, at_least(0))
-    """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
-    address: str | None = setting(None, WORD)
-    """Address of a cluster's head; null: that of ``RAY_ADDRESS``, a cluster on this machine, or
-    else its cores."""
-    steps: int = setting(16, at_least(1))
-    """Actions of each robot of a worker before it writes them and gets new weights."""
-    sync: bool = False
-    """True if the workers wait for each other and for the updates; if not, no two runs are
-    alike."""
-
-
-@dataclass
 class TrainSettings:
     """A training run."""
 
@@ -278,7 +262,6 @@ class TrainSettings:
     exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
-    ray: RaySettings = field(default_factory=RaySettings)
 
 
 SAME = "same"
@@ -411,6 +394,11 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         raise ValueError(
             f"environment.noise.latency must be 0, got {late}: train a policy with "
             "environment.latency, in seconds, in its place"
+        )
+    if workers := (values.pop("ray", None) or {}).get("workers"):
+        raise ValueError(
+            f"ray.workers must be 0, got {workers}: a run drives its robots itself, and Ray is for "
+            "comparisons"
         )
     structure = OmegaConf.structured(TrainSettings)
     if "method" in values:

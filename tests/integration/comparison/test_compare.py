@@ -126,9 +126,6 @@ def test_a_comparison_keeps_every_episode_and_rejects_other_settings(
     ("setting", "matters"),
     [
         ("evaluation.every=400", True),
-        ("ray.workers=2", True),
-        ("ray.steps=8", True),
-        ("ray.sync=true", True),
         ("threads=2", False),
         ("checkpoint_every=50", False),
         ("tracking.project=other", False),

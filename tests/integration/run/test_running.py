@@ -96,7 +96,6 @@ COMPILER = "InvalidCxxCompiler: No working C++ compiler found"
             ),
             r"not enough memory for .* \(you tried to allocate 9 bytes.\)$",
         ),
-        (type("ActorUnavailableError", (type("RayError", (Exception,), {}),), {})("gone"), "Ray"),
     ],
     ids=lambda value: type(value).__name__,
 )

@@ -270,26 +270,12 @@ def usual() -> TrainSettings:
             "method.signals must hold reward or td_error with learner=dqn",
         ),
         ("learner=dqn learner.compile=true", "learner.compile must be false with dqn, got True"),
-        # Robots and buffer in other processes than the learner.
-        ("ray.workers=-1", "ray.workers must be at least 0, got -1"),
-        ("ray.workers=2 ray.steps=0", "ray.steps must be at least 1, got 0"),
-        ("robots=9 ray.workers=2", "robots must be a multiple of ray.workers=2, got 9"),
-        *(
-            (f"method={method} ray.workers=2", f"ray.workers must be 0 with method={method}, got 2")
-            for method in ("la3p", "ref_er", "reaper")
-        ),
-        (
-            "method=her environment.progress=none ray.workers=2",
-            "ray.workers must be 0 with method=her, got 2",
-        ),
         ("method=her", "environment.progress must be 'none' with goals"),
     ],
 )
 def test_setting_with_a_bad_value_is_rejected_by_name_in_one_sentence(
     usual: TrainSettings, arguments: str, message: str
 ) -> None:
-    if "ray" in arguments:
-        pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
     # Set by hand, as Hydra takes most of the time.
     settings = deepcopy(usual)
     for name, text in (each.split("=") for each in arguments.split(" ")):
