@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.env.reset_options import read_tasks
-from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
-from mpfa_envs.worlds.task import read_task
+from mpfa_envs.generators.generate import world_of_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import EpisodeSource
-    from mpfa_envs.worlds.task import Task
     from mpfa_envs.worlds.world import World
 
 
 class Beginning(NamedTuple):
-    """Source of an episode: its random state, and a given world and task."""
+    """Where an episode came from: its random state and world, unless a reset gave them."""
 
     generator: Mapping[str, Any]
     """State of the robot's random generator."""
@@ -32,19 +29,21 @@ class Beginning(NamedTuple):
     """Episodes that were left in the world before."""
     kept: World | None
     """That world, of a generator of worlds."""
-    given: tuple[World, Task | None] | None
-    """World and task that the options of a reset gave."""
+    given: bool
+    """The options of a reset gave the world or the task."""
 
 
 def robot_to_plain(begin: Beginning, speeds: NDArray[np.float64]) -> dict[str, Any]:
     """Turn the beginning of an episode, and the wheel speeds since, into plain values."""
-    world, task = begin.given or (None, None)
+    if begin.given:
+        raise ValueError(
+            "an episode cannot be saved whose world or task the options of a reset gave: save "
+            "after the next reset() without them"
+        )
     return {
         "generator": copy.deepcopy(begin.generator),
         "left": begin.left,
-        "kept": world_to_plain(begin.kept) if begin.kept and begin.left else None,
-        "world": world and world_to_plain(world),
-        "task": task and [list(task.start), list(task.goal)],
+        "kept": begin.kept.name if begin.kept and begin.left else None,
         "speeds": speeds,
     }
 
@@ -80,17 +79,16 @@ def read_state(
 
 def _read_beginnings(robots: list[dict[str, Any]], source: EpisodeSource) -> list[Beginning]:
     """Check where the episodes of a state began."""
-    worlds = [robot["world"] and world_from_plain(robot["world"]) for robot in robots]
-    tasks = [robot["task"] and read_task(robot["task"]) for robot in robots]
-    given = read_tasks({"worlds": worlds, "tasks": tasks}, len(robots), source)
     begins = []
-    for robot, options in zip(robots, given, strict=True):
+    for robot in robots:
         left = check_count("left", robot["left"], least=0)
-        kept = world_from_plain(robot["kept"]) if left else None
+        kept = world_of_name(str(robot["kept"])) if left else None
+        if left and kept is None:
+            raise ValueError(f"kept must name a generator's world, got {robot['kept']!r}")
         if kept is not None:
             source.check_world(kept)
         begin = generator_at(robot["generator"]).bit_generator.state
-        begins.append(Beginning(begin, left, kept, options))
+        begins.append(Beginning(begin, left, kept, given=False))
     return begins
 
 
