@@ -73,6 +73,14 @@ def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     }
 
 
+def episode_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
+    """Return the arguments that decide which episodes follow one another."""
+    return {
+        "max_goal_distance": settings.max_goal_distance or math.inf,
+        "episodes_per_world": settings.episodes_per_world,
+    }
+
+
 def _costly_reward(settings: EnvironmentSettings) -> RewardFunction:
     """Eq. (25) with a cost of time."""
     scale, cost = settings.progress_scale, settings.step_cost
@@ -93,8 +101,7 @@ def make_training_env(
         num_envs=robots,
         info_keys=INFO,
         hindsight=hindsight,
-        max_goal_distance=settings.max_goal_distance or math.inf,
-        episodes_per_world=settings.episodes_per_world,
+        **episode_arguments(settings),
         **task_arguments(settings),
     )
     return TransformedEnv(env, DiscreteWheels()) if discrete else env

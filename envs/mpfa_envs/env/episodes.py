@@ -68,10 +68,10 @@ class EpisodeSource:
         robots: int,
         config: TaskConfig,
         *,
-        split: Literal["train", "validation"],
-        difficulty: float | None,
-        episodes_per_world: int,
-        max_goal_distance: float,
+        split: Literal["train", "validation"] = "train",
+        difficulty: float | None = None,
+        episodes_per_world: int = 1,
+        max_goal_distance: float = math.inf,
     ) -> None:
         self.rejected = 0
         """Worlds of the generator that had no task."""
