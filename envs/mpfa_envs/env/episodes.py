@@ -6,13 +6,12 @@ import copy
 import hashlib
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
-from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -51,6 +50,26 @@ class Episode(NamedTuple):
     """Lengths of the paths to the goal, if the progress is along the shortest path."""
     walkers: WalkerStarts
     """Starts of the walkers."""
+
+
+class EpisodeState(NamedTuple):
+    """Where an episode came from: its random state and world, unless a reset gave them."""
+
+    generator: Mapping[str, Any]
+    """State of the robot's random generator."""
+    left: int
+    """Episodes that were left in the world before."""
+    kept: World | None
+    """That world, of a generator of worlds."""
+    given: bool
+    """The options of a reset gave the world or the task."""
+
+
+def generator_at(state: Mapping[str, Any]) -> np.random.Generator:
+    """Make a random generator of a state."""
+    generator = np.random.default_rng(0)
+    generator.bit_generator.state = state
+    return generator
 
 
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
@@ -101,7 +120,7 @@ class EpisodeSource:
             warn_of_parts(place, config.robot, kept)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
-        self.begins: dict[int, Beginning] = {}
+        self.begins: dict[int, EpisodeState] = {}
         """Where each robot's episode came from."""
         # A world without any task fails here, before anything runs.
         rng = np.random.default_rng(0)
@@ -126,7 +145,7 @@ class EpisodeSource:
         for robot in renewed:
             self._left[robot] = 0
         begins = {
-            robot: Beginning(
+            robot: EpisodeState(
                 rngs[robot].bit_generator.state,
                 self._left[robot],
                 self._worlds[robot] if self._generator else None,
@@ -148,7 +167,7 @@ class EpisodeSource:
         return episodes
 
     def sample_again(
-        self, begins: Sequence[Beginning], *, rejected: int
+        self, begins: Sequence[EpisodeState], *, rejected: int
     ) -> tuple[EpisodeSource, list[Episode], list[np.random.Generator]]:
         """Sample episodes from the beginnings of all robots, or of none, in a copy."""
         rngs = [generator_at(begin.generator) for begin in begins]

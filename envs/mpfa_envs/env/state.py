@@ -5,35 +5,21 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.env.episodes import EpisodeSource, EpisodeState, generator_at
 from mpfa_envs.generators.generate import world_of_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.env.episodes import EpisodeSource
-    from mpfa_envs.worlds.world import World
 
 
-class Beginning(NamedTuple):
-    """Where an episode came from: its random state and world, unless a reset gave them."""
-
-    generator: Mapping[str, Any]
-    """State of the robot's random generator."""
-    left: int
-    """Episodes that were left in the world before."""
-    kept: World | None
-    """That world, of a generator of worlds."""
-    given: bool
-    """The options of a reset gave the world or the task."""
-
-
-def robot_to_plain(begin: Beginning, speeds: NDArray[np.float64]) -> dict[str, Any]:
+def robot_to_plain(begin: EpisodeState, speeds: NDArray[np.float64]) -> dict[str, Any]:
     """Turn the beginning of an episode, and the wheel speeds since, into plain values."""
     if begin.given:
         raise ValueError(
@@ -50,7 +36,7 @@ def robot_to_plain(begin: Beginning, speeds: NDArray[np.float64]) -> dict[str, A
 
 def read_state(
     state: Any, arguments: Mapping[str, Any], config: TaskConfig, source: EpisodeSource
-) -> tuple[list[Beginning], list[NDArray[np.float64]], list[np.random.Generator | None]]:
+) -> tuple[list[EpisodeState], list[NDArray[np.float64]], list[np.random.Generator | None]]:
     """Check a state: beginnings, wheel speeds since, and generators of the next episodes."""
     try:
         if "batch" in state:
@@ -71,13 +57,13 @@ def read_state(
         check_count("rejected", state["rejected"], least=0, most=math.inf)
         driven = [_read_speeds(robot["speeds"], config) for robot in robots]
         seeded = [None if seed is None else generator_at(seed) for seed in state["seeded"]]
-        return _read_beginnings(robots, source), driven, seeded
+        return _read_states(robots, source), driven, seeded
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         reason = error if isinstance(error, ValueError) else f"no state_dict() gave it, {error!r}"
         raise ValueError(f"state cannot be loaded: {reason}") from error
 
 
-def _read_beginnings(robots: list[dict[str, Any]], source: EpisodeSource) -> list[Beginning]:
+def _read_states(robots: list[dict[str, Any]], source: EpisodeSource) -> list[EpisodeState]:
     """Check where the episodes of a state began."""
     begins = []
     for robot in robots:
@@ -88,7 +74,7 @@ def _read_beginnings(robots: list[dict[str, Any]], source: EpisodeSource) -> lis
         if kept is not None:
             source.check_world(kept)
         begin = generator_at(robot["generator"]).bit_generator.state
-        begins.append(Beginning(begin, left, kept, given=False))
+        begins.append(EpisodeState(begin, left, kept, given=False))
     return begins
 
 
@@ -105,10 +91,3 @@ def _read_speeds(values: Any, config: TaskConfig) -> NDArray[np.float64]:
             f"others of which are {speeds[~inside].tolist()}"
         )
     return speeds
-
-
-def generator_at(state: Mapping[str, Any]) -> np.random.Generator:
-    """Make a random generator of a state."""
-    generator = np.random.default_rng(0)
-    generator.bit_generator.state = state
-    return generator
