@@ -24,7 +24,7 @@ from benchmarks.speed.bullet_world import BulletWorld
 from benchmarks.speed.timing import Call, Entry, entry, seconds_per_call, take_turns
 from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, TaskConfig, World
 from mpfa_envs.paths.lengths import grid_for, is_reachable, shortest_length
-from mpfa_envs.planners import astar_path
+from mpfa_envs.planners import shortest_path
 from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.tasks.sampling import evaluation_pairs
 
@@ -122,7 +122,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
     """Follow the shortest path, at the paper's collision distance if possible; return the same."""
     start, goal = options["start"][:2], options["goal"]
     for radius in (TaskConfig(**PAPER_TASK).collision_distance, env.config.robot.radius):
-        path = astar_path(grid_for(env.world, radius), start, goal)
+        path = shortest_path(grid_for(env.world, radius), start, goal)
         if path is not None:
             return _follow(env, options, path[1:])
     raise ValueError(f"there is no path from {start} to {goal}")

@@ -28,6 +28,8 @@ from training.settings.train import TrainSettings
 
 _DISTANCE = 0.14
 """Farthest that a robot drives in an action [m], unless it is faster than that in 0.2 s."""
+_OF_THE_ROBOT = ("physics", "memory", "history")
+_OF_THE_TASK = ("max_steps", "clearance", "progress", "progress_scale", "detour_chance", "latency")
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
@@ -44,12 +46,10 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     }
     return {
         "robot": robot,
-        "physics": settings.physics,
+        **{name: getattr(settings, name) for name in _OF_THE_ROBOT},
         "action_repeat": _repeat(robot)
         if settings.action_repeat is None
         else settings.action_repeat,
-        "memory": settings.memory,
-        "history": settings.history,
         **seen,
         **given,
         # The lidar saturates where the training ends an episode, and shows all distances above; a
@@ -66,15 +66,18 @@ def _repeat(robot: RobotModel) -> int:
 def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     """Return the task to learn: what a policy needs, rewards, and ends of an episode."""
     return {
-        "max_steps": settings.max_steps,
-        "clearance": settings.clearance,
-        "progress": settings.progress,
-        "progress_scale": settings.progress_scale,
-        "detour_chance": settings.detour_chance,
+        **{name: getattr(settings, name) for name in _OF_THE_TASK},
         "noise": asdict(settings.noise),
-        "latency": settings.latency,
         **env_arguments(settings),
         **({"reward": _costly_reward(settings)} if settings.step_cost else {}),
+    }
+
+
+def episode_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
+    """Return the arguments that decide which episodes follow one another."""
+    return {
+        "max_goal_distance": settings.max_goal_distance or math.inf,
+        "episodes_per_world": settings.episodes_per_world,
     }
 
 
@@ -98,8 +101,7 @@ def make_training_env(
         num_envs=robots,
         info_keys=INFO,
         hindsight=hindsight,
-        max_goal_distance=settings.max_goal_distance or math.inf,
-        episodes_per_world=settings.episodes_per_world,
+        **episode_arguments(settings),
         **task_arguments(settings),
     )
     return TransformedEnv(env, DiscreteWheels()) if discrete else env

@@ -31,16 +31,16 @@ def watch(
     """
     window: Window | None = None
     for number, task in enumerate(tasks):
-        for moment in drive_episode(policy, task, seed=number, **env_arguments):
-            env = moment.env
+        for step in drive_episode(policy, task, seed=number, **env_arguments):
+            env = step.env
             if window is None:
                 fps = speed / (env.config.time_step * env.config.action_repeat)
                 window = Window("N: next task   Escape: end", fps=fps)
             (picture,) = env.render() or ()
             if not window.show(picture) or "n" in window.pressed:
                 break
-            if moment.wheels is None:
-                yield _end(task.world.name, moment.info)
+            if step.wheels is None:
+                yield _end(task.world.name, step.info)
                 for _ in range(round(_PAUSE / (env.config.time_step * env.config.action_repeat))):
                     window.show(picture)
         if window is not None and window.closed:

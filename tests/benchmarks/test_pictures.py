@@ -26,9 +26,9 @@ ANIMATION = DOCS / "images/pictures/episode.gif"
 def test_the_animation_of_the_readme_ends_in_the_goal() -> None:
     driver = filtered(load_policy(pictures.SHIPPED))
     number, task = pictures.filmed(driver)
-    for moment in drive_episode(driver, task, seed=number, physics=pictures.PHYSICS):
-        if moment.wheels is None:
-            (last,), reached = moment.env.render(), moment.info["success"]
+    for step in drive_episode(driver, task, seed=number, physics=pictures.PHYSICS):
+        if step.wheels is None:
+            (last,), reached = step.env.render(), step.info["success"]
     assert reached.all()
     with Image.open(ANIMATION) as animation:
         animation.seek(animation.n_frames - 1)

@@ -27,7 +27,6 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import is_reachable
 from mpfa_envs.paths.tasks import sample_task_on_grid
-from mpfa_envs.worlds.plain import walker_to_plain
 
 NAMES = list(GENERATORS)
 PINNED = {
@@ -47,7 +46,9 @@ def fingerprint(world: World) -> str:
     """All numbers of a world; what a printer may change with the version is left out."""
     text = repr([part.tolist() for part in world.arrays])
     if world.walkers:
-        text += repr([list(walker_to_plain(walker).values()) for walker in world.walkers])
+        text += repr(
+            [[w.radius, w.speed, w.behavior, list(map(list, w.waypoints))] for w in world.walkers]
+        )
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -31,15 +31,13 @@ from mpfa_envs.planners import (
     MapPlanner,
     PurePursuit,
     Search,
-    astar_path,
-    dijkstra_path,
     path_length,
+    shortest_path,
 )
 from mpfa_envs.planners.ant_colony import moves_of_cells
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.sensing.observation import Memory
 
-SEARCHES = {"astar": astar_path, "dijkstra": dijkstra_path}
 # A wall from side to side: nothing gets through.
 DIVIDED = World(name="divided", size=(4.0, 4.0), boxes=(Box(-0.1, -2.0, 0.1, 2.0),))
 FULL = World(name="full", size=(1.0, 1.0), boxes=(Box(-0.5, -0.5, 0.5, 0.5),))
@@ -58,13 +56,12 @@ def places(grid: FreeGrid, count: int, seed: int = 0) -> list[tuple[float, float
 
 
 @pytest.mark.parametrize("world", ["D", "bars-3", "mazes-3"])
-@pytest.mark.parametrize("name", SEARCHES)
-def test_a_path_is_as_long_as_that_of_the_grid(name: str, world: str) -> None:
+def test_a_path_is_as_long_as_that_of_the_grid(world: str) -> None:
     room = resolve_world(world)
     grid = FreeGrid(room, distance=0.25, resolution=0.2)
     ends = places(grid, 12)
     for start, goal in zip(ends[:6], ends[6:], strict=True):
-        path = SEARCHES[name](grid, start, goal)
+        path = shortest_path(grid, start, goal)
         assert path is not None and path[0] == start and path[-1] == goal
         assert path_length(grid, path) == pytest.approx(grid.length(start, goal), abs=1e-9)
         for x, y in path[1:-1]:
@@ -77,7 +74,7 @@ def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
     neighbors, lengths = moves_of_cells(grid)
     np.testing.assert_array_equal(neighbors < len(grid.cells), np.isfinite(lengths))
     number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
-    for search in (astar_path, dijkstra_path, AntColony(ants=4, iterations=2)):
+    for search in (shortest_path, AntColony(ants=4, iterations=2)):
         path = search(grid, start, goal)
         assert path is not None
         cells = [number[grid.index(*place)] for place in path[1:-1]]
@@ -86,20 +83,20 @@ def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
 
 
 @pytest.mark.slow
-def test_astar_in_a_room_of_80_m_is_soon_there_and_takes_little_memory() -> None:
+def test_a_path_in_a_room_of_80_m_is_soon_there_and_takes_little_memory() -> None:
     # In a process of its own, as the peak of a process never falls.
     code = """
 import resource, time
 from mpfa_envs import World
 from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.planners import astar_path
+from mpfa_envs.planners import shortest_path
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for side in (4.0, 80.0):  # The first compiles the loops.
     before, began = peak(), time.process_time()
     grid = FreeGrid(World(name="hall", size=(side, side)), distance=0.25)
     corner = side / 2 - 0.5
-    assert astar_path(grid, (-corner, -corner), (corner, 0.3 * corner)) is not None
+    assert shortest_path(grid, (-corner, -corner), (corner, 0.3 * corner)) is not None
 print((peak() - before) / 1024, time.process_time() - began)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -192,14 +189,14 @@ def test_ants_stop_after_the_iteration_in_which_time_is_up() -> None:
     assert hurried == AntColony(iterations=1)(grid, *ends)
 
 
-@pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
+@pytest.mark.parametrize("search", [shortest_path, AntColony(ants=3, iterations=2)])
 def test_a_blocked_goal_has_no_path(search: Search) -> None:
     divided = FreeGrid(DIVIDED, distance=0.25)
     assert search(divided, (-1.0, 0.0), (1.0, 0.0)) is None
     assert search(FreeGrid(FULL, distance=0.25), (0.0, 0.0), (0.1, 0.0)) is None
 
 
-@pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
+@pytest.mark.parametrize("search", [shortest_path, AntColony(ants=3, iterations=2)])
 def test_a_goal_in_the_starts_cell_has_a_path(search: Search) -> None:
     path = search(FreeGrid(WORLDS["A"], distance=0.25), (0.01, 0.02), (0.04, 0.03))
     assert path is not None
@@ -311,21 +308,21 @@ def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
     gap = World(
         name="gap", size=(4.0, 4.0), boxes=(Box(-0.1, 0.23, 0.1, 2.0), Box(-0.1, -2.0, 0.1, -0.23))
     )
-    path, grid = MapPlanner(dijkstra_path).plan(gap, (-1.0, 0.0), (1.0, 0.0))
+    path, grid = MapPlanner(shortest_path).plan(gap, (-1.0, 0.0), (1.0, 0.0))
     assert len(path) > 2
     assert grid.distance < 0.25
     # Where there is no path at all it tries its luck.
-    straight, _ = MapPlanner(dijkstra_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
+    straight, _ = MapPlanner(shortest_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
     assert straight == [(-1.0, 0.0), (1.0, 0.0)]
 
 
 def test_a_planner_plans_in_the_world_that_it_is_in() -> None:
-    planner = MapPlanner(dijkstra_path)
+    planner = MapPlanner(shortest_path)
     ends = (-4.0, -4.0), (4.0, 4.0)
     planner.plan(WORLDS["A"], *ends)
     path, grid = planner.plan(WORLDS["D"], *ends)
     assert grid.world is WORLDS["D"]
-    assert path == MapPlanner(dijkstra_path).plan(WORLDS["D"], *ends)[0]
+    assert path == MapPlanner(shortest_path).plan(WORLDS["D"], *ends)[0]
 
 
 def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,9 @@ from mpfa_envs import (
     NavigationEnv,
     RewardTerms,
     StepOutcome,
+    Task,
     VectorNavigationEnv,
+    World,
     navigation_reward,
 )
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -37,6 +39,47 @@ def test_the_scales_are_arguments() -> None:
     assert navigation_reward(outcome(2.0, 1.0), **scales).progress == 7.0
     assert navigation_reward(outcome(2.0, 1.0, success=True), **scales).total == 30.0
     assert navigation_reward(outcome(2.0, 1.0, collision=True), **scales).total == -20.0
+
+
+SCALES = {"goal_reward": 3, "collision_reward": -7.0, "progress_scale": 2.0, "step_cost": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("step", "terms"),
+    [
+        (outcome(2.0, 1.5), (0.0, 0.0, 1.0, -0.25)),
+        (outcome(1.5, 2.0), (0.0, 0.0, -1.0, -0.25)),
+        (outcome(2.0, 1.5, success=True), (3.0, 0.0, 0.0, 0.0)),
+        (outcome(2.0, 1.5, collision=True), (0.0, -7.0, 0.0, 0.0)),
+    ],
+)
+def test_each_term_has_the_sign_and_the_size_of_the_equation(step, terms) -> None:
+    assert navigation_reward(step, **SCALES) == terms
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "terms"),
+    [
+        # Two time steps of 0.05 m, ahead to the goal, away from it, to its rim, and to the wall.
+        ((0.0, 0.0, 0.0), (3.0, 0.0), (0.0, 0.0, 0.2, -0.5)),
+        ((0.0, 0.0, math.pi), (3.0, 0.0), (0.0, 0.0, -0.2, -0.5)),
+        ((0.0, 0.0, 0.0), (0.59, 0.0), (3.0, 0.0, 0.1, -0.25)),
+        ((4.66, 0.0, 0.0), (-3.0, 0.0), (0.0, -7.0, -0.1, -0.25)),
+    ],
+)
+def test_a_driven_step_is_paid_by_the_equation(start, goal, terms) -> None:
+    env = VectorNavigationEnv(
+        2,
+        world=World(name="empty"),
+        physics="kinematic",
+        action_repeat=2,
+        reward=partial(navigation_reward, **SCALES),
+    )
+    env.reset(seed=0, options={"tasks": [Task(start, goal), Task((0.0, 0.0, 0.0), (4.0, 4.0))]})
+    *_, infos = env.step(np.ones((2, 2), np.float32))
+    names = ("goal", "collision", "progress", "other")
+    paid = [infos[f"reward_{name}"][0] for name in names]
+    np.testing.assert_allclose(paid, terms, atol=1e-9)
 
 
 def one_robot(**arguments: object) -> float:

@@ -10,14 +10,12 @@ from pathlib import Path
 import pytest
 
 from mpfa_envs import Walker, World, load_world, save_world
-from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 from tests.envs.test_walkers import BUSY, ROUND, STANDING
 
 
 def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:
     save_world(BUSY, tmp_path / "busy.yaml")
     assert load_world(tmp_path / "busy.yaml") == BUSY
-    assert world_from_plain(world_to_plain(BUSY)) == BUSY
     assert hash(BUSY) == hash(replace(BUSY)) != hash(STANDING)
     (tmp_path / "short.yaml").write_text("size: [4, 4]\nwalkers:\n  - {speed: 0.2}\n")
     assert load_world(tmp_path / "short.yaml").walkers == (Walker(speed=0.2),)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
-from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -22,7 +22,6 @@ from mpfa_envs.tasks.doors import cell_share, warn_of_parts
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.plain import fingerprint
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
@@ -53,6 +52,26 @@ class Episode(NamedTuple):
     """Starts of the walkers."""
 
 
+class EpisodeState(NamedTuple):
+    """Where an episode came from: its random state and world, unless a reset gave them."""
+
+    generator: Mapping[str, Any]
+    """State of the robot's random generator."""
+    left: int
+    """Episodes that were left in the world before."""
+    kept: World | None
+    """That world, of a generator of worlds."""
+    given: bool
+    """The options of a reset gave the world or the task."""
+
+
+def generator_at(state: Mapping[str, Any]) -> np.random.Generator:
+    """Make a random generator of a state."""
+    generator = np.random.default_rng(0)
+    generator.bit_generator.state = state
+    return generator
+
+
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
     """Measure the paths to a goal that keep a distance [m]; on a map only around the goal."""
     longest = math.inf if world.occupancy is None else LONGEST_PATH
@@ -68,10 +87,10 @@ class EpisodeSource:
         robots: int,
         config: TaskConfig,
         *,
-        split: Literal["train", "validation"],
-        difficulty: float | None,
-        episodes_per_world: int,
-        max_goal_distance: float,
+        split: Literal["train", "validation"] = "train",
+        difficulty: float | None = None,
+        episodes_per_world: int = 1,
+        max_goal_distance: float = math.inf,
     ) -> None:
         self.rejected = 0
         """Worlds of the generator that had no task."""
@@ -101,8 +120,8 @@ class EpisodeSource:
             warn_of_parts(place, config.robot, kept)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
-        self.begins: dict[int, Beginning] = {}
-        """Source of each robot's episode: its random state, and a given world and task."""
+        self.begins: dict[int, EpisodeState] = {}
+        """Where each robot's episode came from."""
         # A world without any task fails here, before anything runs.
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
@@ -126,16 +145,19 @@ class EpisodeSource:
         for robot in renewed:
             self._left[robot] = 0
         begins = {
-            robot: Beginning(
+            robot: EpisodeState(
                 rngs[robot].bit_generator.state,
                 self._left[robot],
                 self._worlds[robot] if self._generator else None,
-                None if given is None else given[robot],
+                given is not None and given[robot] is not None,
             )
             for robot in robots
         }
         try:
-            episodes = [self._sample_next(each, rngs[each], begins[each].given) for each in robots]
+            episodes = [
+                self._sample_next(robot, rngs[robot], None if given is None else given[robot])
+                for robot in robots
+            ]
         except BaseException:
             self.rejected, self._left, self._worlds = before
             for robot, begin in begins.items():
@@ -145,7 +167,7 @@ class EpisodeSource:
         return episodes
 
     def sample_again(
-        self, begins: Sequence[Beginning], *, rejected: int
+        self, begins: Sequence[EpisodeState], *, rejected: int
     ) -> tuple[EpisodeSource, list[Episode], list[np.random.Generator]]:
         """Sample episodes from the beginnings of all robots, or of none, in a copy."""
         rngs = [generator_at(begin.generator) for begin in begins]
@@ -154,7 +176,7 @@ class EpisodeSource:
         source._left = [begin.left for begin in begins] or [0] * len(self._left)
         if self._generator:
             source._worlds = [begin.kept for begin in begins] or [None] * len(self._left)
-        episodes = source.sample(range(len(begins)), rngs, [begin.given for begin in begins])
+        episodes = source.sample(range(len(begins)), rngs)
         source.rejected = rejected
         return source, episodes, rngs
 
@@ -180,7 +202,7 @@ class EpisodeSource:
         """Plain values by name: the arguments that decide which episodes come."""
         world: str | list[str] | None = self._generator
         if world is None:
-            names = {id(each): fingerprint(each) for each in self._worlds if each is not None}
+            names = {id(each): _fingerprint(each) for each in self._worlds if each is not None}
             world = [names[id(each)] for each in self._worlds]
             world = world[0] if len(names) == 1 else world
         return {
@@ -307,3 +329,19 @@ def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
             raise ValueError("world must hold at least one world, got an empty sequence")
         return [resolve_world(each) for each in world]
     return [resolve_world(world)]
+
+
+def _fingerprint(world: World) -> str:
+    """Name and hash of a world, which differs even from worlds with its name."""
+    cells = b"" if world.occupancy is None else world.occupancy.digest
+    regions = [
+        [tuple(map(float, region.bounds)) for region in some]
+        for some in (world.start_regions, world.goal_regions)
+    ]
+    walkers = [
+        (float(one.radius), float(one.speed), one.behavior, one.waypoints) for one in world.walkers
+    ]
+    # 1 and 1.0 are the same number, but not the same text.
+    numbers = [part.tolist() for part in world.arrays], regions, walkers
+    digest = hashlib.sha256(repr(numbers).encode() + cells)
+    return f"{world.name} ({digest.hexdigest()[:8]})"

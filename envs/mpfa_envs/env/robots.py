@@ -20,7 +20,7 @@ from mpfa_envs.env.step_loops import (
     measure_remaining,
     settle,
 )
-from mpfa_envs.paths.batch import FieldBatch
+from mpfa_envs.paths.batch import FieldArrays
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
@@ -63,7 +63,7 @@ class RobotBatch:
             self.worlds, radius=config.robot.radius, time_step=config.time_step
         )
         """The walkers around each robot."""
-        self._fields = FieldBatch(count) if config.progress == "shortest_path" else None
+        self._fields = FieldArrays.empty(count) if config.progress == "shortest_path" else None
         self.episodes = EpisodeArrays(
             motions=np.zeros((count, 5)),
             goals=np.zeros((count, 2)),
@@ -114,7 +114,7 @@ class RobotBatch:
         distance = math.dist((x, y), task.goal)
         remaining = distance
         if self._fields is not None and episode.field is not None:
-            self._fields[index] = episode.field
+            self._fields = self._fields.with_field(index, episode.field)
             remaining = episode.field.at(x, y)
         self.walkers.begin(index, episode.walkers)
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
@@ -189,7 +189,7 @@ class RobotBatch:
                 self._config.max_steps,
             )
             if self._fields is not None:
-                measure_remaining(episodes, running, self._fields.arrays)
+                measure_remaining(episodes, running, self._fields)
             if self._payments is None:
                 self._pay_by_function(running)
             if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0, 0.0)):

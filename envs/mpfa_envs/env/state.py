@@ -5,53 +5,38 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.env.reset_options import read_tasks
-from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
-from mpfa_envs.worlds.task import read_task
+from mpfa_envs.env.episodes import EpisodeSource, EpisodeState, generator_at
+from mpfa_envs.generators.generate import world_of_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.env.episodes import EpisodeSource
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
 
 
-class Beginning(NamedTuple):
-    """Source of an episode: its random state, and a given world and task."""
-
-    generator: Mapping[str, Any]
-    """State of the robot's random generator."""
-    left: int
-    """Episodes that were left in the world before."""
-    kept: World | None
-    """That world, of a generator of worlds."""
-    given: tuple[World, Task | None] | None
-    """World and task that the options of a reset gave."""
-
-
-def robot_to_plain(begin: Beginning, speeds: NDArray[np.float64]) -> dict[str, Any]:
+def robot_to_plain(begin: EpisodeState, speeds: NDArray[np.float64]) -> dict[str, Any]:
     """Turn the beginning of an episode, and the wheel speeds since, into plain values."""
-    world, task = begin.given or (None, None)
+    if begin.given:
+        raise ValueError(
+            "an episode cannot be saved whose world or task the options of a reset gave: save "
+            "after the next reset() without them"
+        )
     return {
         "generator": copy.deepcopy(begin.generator),
         "left": begin.left,
-        "kept": world_to_plain(begin.kept) if begin.kept and begin.left else None,
-        "world": world and world_to_plain(world),
-        "task": task and [list(task.start), list(task.goal)],
+        "kept": begin.kept.name if begin.kept and begin.left else None,
         "speeds": speeds,
     }
 
 
 def read_state(
     state: Any, arguments: Mapping[str, Any], config: TaskConfig, source: EpisodeSource
-) -> tuple[list[Beginning], list[NDArray[np.float64]], list[np.random.Generator | None]]:
+) -> tuple[list[EpisodeState], list[NDArray[np.float64]], list[np.random.Generator | None]]:
     """Check a state: beginnings, wheel speeds since, and generators of the next episodes."""
     try:
         if "batch" in state:
@@ -72,25 +57,24 @@ def read_state(
         check_count("rejected", state["rejected"], least=0, most=math.inf)
         driven = [_read_speeds(robot["speeds"], config) for robot in robots]
         seeded = [None if seed is None else generator_at(seed) for seed in state["seeded"]]
-        return _read_beginnings(robots, source), driven, seeded
+        return _read_states(robots, source), driven, seeded
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         reason = error if isinstance(error, ValueError) else f"no state_dict() gave it, {error!r}"
         raise ValueError(f"state cannot be loaded: {reason}") from error
 
 
-def _read_beginnings(robots: list[dict[str, Any]], source: EpisodeSource) -> list[Beginning]:
+def _read_states(robots: list[dict[str, Any]], source: EpisodeSource) -> list[EpisodeState]:
     """Check where the episodes of a state began."""
-    worlds = [robot["world"] and world_from_plain(robot["world"]) for robot in robots]
-    tasks = [robot["task"] and read_task(robot["task"]) for robot in robots]
-    given = read_tasks({"worlds": worlds, "tasks": tasks}, len(robots), source)
     begins = []
-    for robot, options in zip(robots, given, strict=True):
+    for robot in robots:
         left = check_count("left", robot["left"], least=0)
-        kept = world_from_plain(robot["kept"]) if left else None
+        kept = world_of_name(str(robot["kept"])) if left else None
+        if left and kept is None:
+            raise ValueError(f"kept must name a generator's world, got {robot['kept']!r}")
         if kept is not None:
             source.check_world(kept)
         begin = generator_at(robot["generator"]).bit_generator.state
-        begins.append(Beginning(begin, left, kept, options))
+        begins.append(EpisodeState(begin, left, kept, given=False))
     return begins
 
 
@@ -107,10 +91,3 @@ def _read_speeds(values: Any, config: TaskConfig) -> NDArray[np.float64]:
             f"others of which are {speeds[~inside].tolist()}"
         )
     return speeds
-
-
-def generator_at(state: Mapping[str, Any]) -> np.random.Generator:
-    """Make a random generator of a state."""
-    generator = np.random.default_rng(0)
-    generator.bit_generator.state = state
-    return generator

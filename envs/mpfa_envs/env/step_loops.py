@@ -9,6 +9,7 @@ import numpy as np
 
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
+from mpfa_envs.tasks.reward import reward_terms
 from mpfa_envs.worlds.clearance_loops import clearance_at
 
 if TYPE_CHECKING:
@@ -108,15 +109,12 @@ def settle(
     for robot in range(running.shape[0]):
         if not running[robot]:
             continue
-        if flags[SUCCESS, robot]:
-            numbers[REWARD, robot] += payments[0]
-        elif flags[COLLISION, robot]:
-            numbers[REWARD + 1, robot] += payments[1]
-        else:
-            approach = episodes.remaining[1, robot] - episodes.remaining[0, robot]
-            numbers[REWARD + 2, robot] += payments[2] * approach
-            numbers[REWARD + 3, robot] -= payments[3]
-        ended = flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]
+        success, collision = flags[SUCCESS, robot], flags[COLLISION, robot]
+        approach = episodes.remaining[1, robot] - episodes.remaining[0, robot]
+        terms = reward_terms(success, collision, approach, payments)
+        for k in range(len(terms)):
+            numbers[REWARD + k, robot] += terms[k]
+        ended = success or collision or flags[TIMEOUT, robot]
         running[robot] = not ended
         left |= not ended
     return left

@@ -367,7 +367,8 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
         Returns:
             Plain values and arrays: for each robot the state of its source of randomness where its
-            episode began, the world and the task if they were given, and the actions since.
+            episode began, the name of a world that it keeps, and the actions since. ValueError if
+            the options of a reset gave an episode its world or task.
         """
         robots = range(self.num_envs) if self._begun else ()
         begins, driven = self._source.begins, self._batch.driven

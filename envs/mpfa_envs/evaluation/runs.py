@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -260,11 +260,12 @@ def run_tasks(
         for env, numbers in fleets:
             _check(env, tasks, numbers)
         for env, numbers in fleets:
-            for robot, number, result in _drive(env, driver, tasks, deque(numbers)):
-                results[number] = result
-                advance()
-                if on_end:
-                    on_end(env, robot, number)
+            for step in drive_steps(env, driver, tasks, numbers):
+                for robot, number, result in step.ended:
+                    results[number] = result
+                    advance()
+                    if on_end:
+                        on_end(env, robot, number)
     return [results[number] for number in range(len(tasks))]
 
 
@@ -311,20 +312,39 @@ def _room_for(worlds: Sequence[World]) -> World:
     return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
 
 
-def _drive(
-    env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], waiting: deque[int]
-) -> Iterator[tuple[int, int, EpisodeResult]]:
-    """Drive the tasks that wait; numbers of robot and task, and the result, as each one ends."""
-    at_work = np.full(env.num_envs, -1)
+class FleetStep(NamedTuple):
+    """A decision of all robots that drive, before it is carried out, or the end of episodes."""
+
+    observations: NDArray[np.float32]
+    """Of all robots, ``[N, O]``."""
+    info: dict[str, Any]
+    """Of all robots, as the environment gives it."""
+    actions: NDArray[np.float32] | None
+    """The decisions, ``[N, 2]``, zero for robots that do not drive; None at an end."""
+    ended: list[tuple[int, int, EpisodeResult]]
+    """Number of the robot, number of the task and result of each episode that ended."""
+
+
+def drive_steps(
+    env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], numbers: Sequence[int]
+) -> Iterator[FleetStep]:
+    """Drive the tasks of these numbers; give each decision, and each end of episodes."""
+    worlds = Counter[int]()
+    episodes = []
+    for task in tasks:
+        episodes.append(worlds[id(task.world)])
+        worlds[id(task.world)] += 1
+    waiting, at_work = deque(numbers), np.full(env.num_envs, -1)
     planned, decided = np.zeros(env.num_envs), np.zeros(env.num_envs)
     decisions = np.zeros(env.num_envs, dtype=np.int64)
     observations = np.empty(env.observation_space.shape or (), np.float32)
+    info: dict[str, Any] = {}
     while waiting or (at_work >= 0).any():
         begun = np.zeros(env.num_envs, dtype=np.bool_)
         for robot in np.flatnonzero(at_work < 0)[: len(waiting)]:
             at_work[robot], begun[robot] = waiting.popleft(), True
         if begun.any():
-            observations = _begin(env, tasks, at_work, begun)
+            observations, info = _begin(env, tasks, at_work, begun)
             decided[begun], decisions[begun] = 0.0, 0
         for robot in np.flatnonzero(begun).tolist():
             start = time.process_time()
@@ -337,11 +357,16 @@ def _drive(
         actions[running] = driver.drive(env, robots, observations[running])
         decided[running] += (time.process_time() - start) / len(robots)
         decisions[running] += 1
+        yield FleetStep(observations, info, actions, [])
         observations, _, terminated, truncated, info = env.step(actions, only=running)
+        ended = []
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
             number, at_work[robot] = int(at_work[robot]), -1
             times = float(planned[robot]), float(decided[robot] / decisions[robot])
-            yield robot, number, _result(env, tasks, number, robot, info, *times)
+            result = _result(env, tasks[number], episodes[number], robot, info, *times)
+            ended.append((robot, number, result))
+        if ended:
+            yield FleetStep(observations, info, None, ended)
 
 
 def _begin(
@@ -349,8 +374,8 @@ def _begin(
     tasks: Sequence[WorldTask],
     at_work: NDArray[np.int64],
     begun: NDArray[np.bool_],
-) -> NDArray[np.float32]:
-    """Put robots at the start of their tasks; observations of all robots, ``[N, O]``."""
+) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Put robots at the start of their tasks; observations and infos of all robots."""
     chosen = [
         tasks[number] if begins else None
         for number, begins in zip(at_work.tolist(), begun, strict=True)
@@ -360,26 +385,26 @@ def _begin(
         for name in ("seed", "world", "task")
     )
     options = {"reset_mask": begun, "worlds": worlds, "tasks": pairs}
-    return env.reset(seed=seeds, options=options)[0]
+    return env.reset(seed=seeds, options=options)
 
 
 def _result(
     env: VectorNavigationEnv,
-    tasks: Sequence[WorldTask],
-    number: int,
+    task: WorldTask,
+    episode: int,
     robot: int,
     info: dict[str, NDArray[Any]],
     plan_s: float,
     decision_s: float,
 ) -> EpisodeResult:
     """Read the result of a task that a robot has driven."""
-    world, reference = tasks[number].world, tasks[number].reference_path
+    world, reference = task.world, task.reference_path
     time_s = float(info["sim_time"][robot])
     driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
     success, timeout = bool(info["success"][robot]), bool(info["timeout"][robot])
     speed, period = env.config.robot.max_wheel_speed, env.config.time_step
     return EpisodeResult(
-        episode=sum(each.world is world for each in tasks[:number]),
+        episode=episode,
         success=success,
         collision=bool(info["collision"][robot]),
         timeout=timeout,
@@ -393,7 +418,9 @@ def _result(
         plan_s=plan_s,
         decision_s=decision_s,
         world=world.name,
-        barn_score=reference and barn_score(success, time_s=time_s, reference_path=reference),
+        barn_score=None
+        if reference is None
+        else barn_score(success, time_s=time_s, reference_path=reference),
         **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
     )
 

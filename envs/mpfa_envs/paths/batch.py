@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.paths.distance import DistanceField
+from mpfa_envs.worlds.arrays import with_row
 
 
 class FieldArrays(NamedTuple):
@@ -22,32 +23,23 @@ class FieldArrays(NamedTuple):
     resolutions: NDArray[np.float64]
     """Side of a cell [m], ``[N]``."""
 
-
-class FieldBatch:
-    """A distance field for each of many robots."""
-
-    def __init__(self, robots: int) -> None:
-        self._fields = FieldArrays(
+    @classmethod
+    def empty(cls, robots: int) -> FieldArrays:
+        """Arrays of robots that have no field yet."""
+        return cls(
             np.zeros((robots, 0, 0), dtype=np.float32),
             np.zeros((robots, 2), dtype=np.int64),
             np.zeros((robots, 2)),
             np.ones(robots),
         )
 
-    @property
-    def arrays(self) -> FieldArrays:
-        """Arrays for compiled loops; setting a larger field may replace them."""
-        return self._fields
-
-    def __setitem__(self, robot: int, field: DistanceField) -> None:
-        nx, ny = field.filled.shape
-        values = self._fields.values
-        if nx > values.shape[1] or ny > values.shape[2]:
-            most = max(nx, values.shape[1]), max(ny, values.shape[2])
-            wider = np.zeros((len(values), *most), dtype=np.float32)
-            wider[:, : values.shape[1], : values.shape[2]] = values
-            self._fields = self._fields._replace(values=wider)
-        self._fields.values[robot, :nx, :ny] = field.filled
-        self._fields.shapes[robot] = nx, ny
-        self._fields.origins[robot] = field.origin
-        self._fields.resolutions[robot] = field.resolution
+    def with_field(self, robot: int, field: DistanceField) -> FieldArrays:
+        """The arrays with the field of a robot, written in place where there is room."""
+        return with_row(
+            self,
+            robot,
+            values=field.filled,
+            shapes=field.filled.shape,
+            origins=field.origin,
+            resolutions=field.resolution,
+        )

@@ -143,13 +143,23 @@ class FreeGrid:
         if not self.free.any():
             raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
         i, j = self.index(*place)
-        cells = _with_neighbors(self.free, i, j) if self.free[i, j] else self.cells
+        own = np.array([[i, j]])
+        cells = np.concatenate((own, self.neighbors(i, j))) if self.free[i, j] else self.cells
         gaps = np.hypot(self.xs[cells[:, 0]] - place[0], self.ys[cells[:, 1]] - place[1])
         if not self.free[i, j]:
             nearest = int(gaps.argmin())
             cells, gaps = cells[nearest : nearest + 1], gaps[nearest : nearest + 1]
         # A gap of zero would be no edge of a graph.
         return cells, np.maximum(gaps, 1e-12)
+
+    def neighbors(self, i: int, j: int) -> NDArray[np.int64]:
+        """Columns and rows of the cells to which a move leads from a cell, ``[cells, 2]``."""
+        free, to = self.free, MOVES[:, :2] + (i, j)
+        inside = ((to >= 0) & (to < free.shape)).all(axis=1)
+        to, moves = to[inside], MOVES[inside]
+        over, under = moves[:, 2:4] + (i, j), moves[:, 4:6] + (i, j)
+        is_open = free[tuple(to.T)] & free[tuple(over.T)] & free[tuple(under.T)]
+        return np.asarray(to[is_open])
 
     def joins(self, start: tuple[float, float], goal: tuple[float, float]) -> bool:
         """Return True if there is a path between two positions (x, y) [m]."""
@@ -274,16 +284,3 @@ class DistanceField:
         """Columns and rows in the window, and which cells lie in it."""
         cells = cells - self.first
         return cells, np.asarray(((cells >= 0) & (cells < shape)).all(axis=1))
-
-
-def _with_neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
-    """A cell, and those to which a move leads from it, ``[cells, 2]``."""
-    columns, rows = free.shape
-    to = MOVES[:, :2] + (i, j)
-    inside = ((to >= 0) & (to < (columns, rows))).all(axis=1)
-    to, moves = to[inside], MOVES[inside]
-    over, under = moves[:, 2:4] + (i, j), moves[:, 4:6] + (i, j)
-    is_open = (
-        free[to[:, 0], to[:, 1]] & free[over[:, 0], over[:, 1]] & free[under[:, 0], under[:, 1]]
-    )
-    return np.concatenate(([[i, j]], to[is_open]))

@@ -1,9 +1,8 @@
-"""Shortest paths over the cells of a grid: lengths from one place, and A* between two."""
+"""Lengths of the shortest paths from one place over the cells of a grid."""
 
 from __future__ import annotations
 
 import math
-from heapq import heappop, heappush
 from typing import Final
 
 import numpy as np
@@ -15,15 +14,6 @@ _BEYOND: Final = 3.0
 """Steps by which the last cell that is needed is exceeded: more than a move is long."""
 _BUCKETS: Final = 8
 """Number of buckets; a move over free cells leads three ahead at most."""
-
-
-@njit
-def _lengths(moves: NDArray[np.int64], step: float) -> NDArray[np.float64]:
-    """Lengths of moves [m]."""
-    lengths = np.empty(len(moves))
-    for k in range(len(moves)):
-        lengths[k] = math.sqrt(moves[k, 0] ** 2 + moves[k, 1] ** 2) * step
-    return lengths
 
 
 @njit
@@ -55,7 +45,7 @@ def path_lengths(
     lengths_to = np.empty((nx, ny))
     lengths_to[:, :] = math.inf
     settled = np.zeros((nx, ny), np.bool_)
-    lengths = _lengths(moves, step)
+    lengths = np.sqrt((moves[:, 0] ** 2 + moves[:, 1] ** 2).astype(np.float64)) * step
     # Lists of cells: the first of each bucket, and behind each entry the next.
     heads = np.empty(buckets, np.int64)
     heads[:] = -1
@@ -114,59 +104,3 @@ def _factor(
     if not (over and under):
         return math.inf
     return float(max(int(free[i, j]), int(free[i + move[0], j + move[1]]), int(over), int(under)))
-
-
-@njit
-def astar_tree(
-    free: NDArray[np.bool_],  # [nx, ny]
-    starts: NDArray[np.int64],  # [starts, 2]
-    start_gaps: NDArray[np.float64],  # [m] [starts]
-    ends: NDArray[np.int64],  # [ends, 2]
-    end_gaps: NDArray[np.float64],  # [m] [ends]
-    estimates: NDArray[np.float64],  # [m] [nx, ny]
-    moves: NDArray[np.int64],
-    step: float,  # [m]
-) -> NDArray[np.int32]:
-    """Cell before each on a shortest path by A*, the last entry the goal's, ``[nx * ny + 1]``."""
-    nx, ny = free.shape
-    goal = nx * ny
-    lengths = _lengths(moves, step)
-    lengths_to = np.full(goal + 1, math.inf)
-    before = np.full(goal + 1, -1, np.int32)
-    # Entries are (whole length, number, cell, length to it, cell before it); of equal lengths the
-    # first entry comes first.
-    queue = [(0.0, 0, -1, 0.0, -1)]
-    queue.pop()
-    entries = 0
-    for k in range(len(starts)):
-        i, j = starts[k]
-        lengths_to[i * ny + j] = start_gaps[k]
-        heappush(queue, (start_gaps[k] + estimates[i, j], k, i * ny + j, start_gaps[k], -1))
-        entries += 1
-    while len(queue) > 0:
-        _, _, cell, length, last = heappop(queue)
-        if lengths_to[cell] < length:
-            continue
-        before[cell] = last
-        if cell == goal:
-            break
-        i, j = cell // ny, cell % ny
-        for k in range(len(moves)):
-            to_i, to_j = i + moves[k, 0], j + moves[k, 1]
-            if to_i < 0 or to_j < 0 or to_i >= nx or to_j >= ny or not free[to_i, to_j]:
-                continue
-            to, longer = to_i * ny + to_j, length + lengths[k]
-            if lengths_to[to] <= longer:
-                continue
-            over, under = (i + moves[k, 2], j + moves[k, 3]), (i + moves[k, 4], j + moves[k, 5])
-            if not (free[over] and free[under]):
-                continue
-            lengths_to[to] = longer
-            heappush(queue, (longer + estimates[to_i, to_j], entries, to, longer, cell))
-            entries += 1
-        for k in range(len(ends)):
-            if ends[k, 0] == i and ends[k, 1] == j and length + end_gaps[k] < lengths_to[goal]:
-                lengths_to[goal] = length + end_gaps[k]
-                heappush(queue, (lengths_to[goal], entries, goal, lengths_to[goal], cell))
-                entries += 1
-    return before

@@ -12,7 +12,7 @@ from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import MapPlanner
 from mpfa_envs.planners.predictive import PredictiveControl
 from mpfa_envs.planners.pure_pursuit import PurePursuit
-from mpfa_envs.planners.search import Search, astar_path, dijkstra_path, path_length
+from mpfa_envs.planners.search import Search, path_length, shortest_path
 from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.sensing.observation import Memory
 
@@ -25,16 +25,15 @@ __all__ = [
     "PurePursuit",
     "Search",
     "WindowScore",
-    "astar_path",
-    "dijkstra_path",
     "make_planner",
     "path_length",
+    "shortest_path",
 ]
 
 PLANNERS: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "astar": "A* on the known map, followed by pure pursuit",
-        "dijkstra": "Dijkstra on the known map, followed by pure pursuit",
+        "astar": "the shortest path on the known map, as of dijkstra, followed by pure pursuit",
+        "dijkstra": "the shortest path on the known map, followed by pure pursuit",
         "ant_colony": "an ant colony on the known map, followed by pure pursuit",
         "dwa": "the dynamic window approach, which sees the observation alone",
         "mpc": "sampling model predictive control, on a map of the robot's own",
@@ -85,4 +84,4 @@ def make_planner(
         raise ValueError(f"memory must be 'none' for {name}, which knows the map, got {memory!r}")
     if name == "ant_colony":
         return MapPlanner(AntColony(seed=seed), robot=robot, resolution=_COARSE)
-    return MapPlanner(astar_path if name == "astar" else dijkstra_path, robot=robot)
+    return MapPlanner(shortest_path, robot=robot)

@@ -45,8 +45,8 @@ class MapPlanner:
 
     Examples:
         >>> from mpfa_envs import evaluate
-        >>> from mpfa_envs.planners import MapPlanner, dijkstra_path
-        >>> planner = MapPlanner(dijkstra_path)
+        >>> from mpfa_envs.planners import MapPlanner, shortest_path
+        >>> planner = MapPlanner(shortest_path)
         >>> [each.success for each in evaluate(planner, "D", episodes=3, physics="kinematic")]
         [True, True, True]
     """

@@ -1,21 +1,16 @@
-"""Shortest paths on the grid of a known world, by two searches."""
+"""The shortest path on the grid of a known world."""
 
 from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.field_loops import astar_tree
-from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.paths.grid_loops import STEP_SCALE
 from mpfa_envs.worlds.shapes import Point
-
-_ORDERED: Final = np.array(sorted(MOVES.tolist(), key=lambda move: min((*move[:2],), (0, 1))))
-"""Moves of A*: to cells of lower numbers first; of paths that are equally short one is found."""
 
 
 class Search(Protocol):
@@ -25,55 +20,35 @@ class Search(Protocol):
         """Positions from start to goal (x, y), with centers of cells between [m]; None if none."""
 
 
-def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest path with Dijkstra's algorithm, as a :class:`Search`.
+def shortest_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
+    """Find the shortest path, as a :class:`Search`.
 
     Examples:
         >>> from mpfa_envs import WORLDS
         >>> from mpfa_envs.paths.distance import FreeGrid
-        >>> from mpfa_envs.planners import dijkstra_path, path_length
+        >>> from mpfa_envs.planners import path_length, shortest_path
         >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
-        >>> path = dijkstra_path(grid, (0.0, 0.0), (4.0, 0.0))
+        >>> path = shortest_path(grid, (0.0, 0.0), (4.0, 0.0))
         >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
         True
     """
-    # A* that knows nothing of where the goal is.
-    return _search(grid, start, goal, np.zeros(grid.free.shape))
-
-
-def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest path with A*, as a :class:`Search`.
-
-    The rest of a path is estimated by the straight line, measured as short as moves are: it is
-    never overestimated, so that the path is a shortest one.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS
-        >>> from mpfa_envs.paths.distance import FreeGrid
-        >>> from mpfa_envs.planners import astar_path, path_length
-        >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
-        >>> path = astar_path(grid, (0.0, 0.0), (4.0, 0.0))
-        >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
-        True
-    """
-    straight = np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1])
-    return _search(grid, start, goal, STEP_SCALE * straight)
-
-
-def _search(
-    grid: FreeGrid, start: Point, goal: Point, estimates: NDArray[np.float64]
-) -> list[Point] | None:
-    """Find a shortest path, with an estimate of the rest of it from each cell [m]."""
-    if not grid.free.any():
+    if not grid.joins(start, goal):
         return None
-    ends = (*grid.around(start), *grid.around(goal))
-    step = grid.resolution * STEP_SCALE
-    before = astar_tree(grid.free, *ends, estimates, _ORDERED, step)
-    places, cell = [goal], before[-1]
-    while cell >= 0:
-        places.append(grid.center(*divmod(int(cell), len(grid.ys))))
-        cell = before[cell]
-    return [start, *places[::-1]] if len(places) > 1 else None
+    # From the goal back to the start, down the lengths of the paths from there.
+    lengths = DistanceField(grid, start, until=goal).lengths
+    firsts, first_gaps = grid.around(start)
+    gap_of = dict(zip(map(tuple, firsts.tolist()), first_gaps.tolist(), strict=True))
+    cells, gaps = grid.around(goal)
+    places = [goal]
+    while True:
+        best = (lengths[cells[:, 0], cells[:, 1]] + gaps).argmin()
+        i, j = cells[best].tolist()
+        places.append(grid.center(i, j))
+        if lengths[i, j] == gap_of.get((i, j)):
+            return [start, *places[::-1]]
+        # The longest moves come first, so that of equally short paths always the same is found.
+        cells = grid.neighbors(i, j)[::-1]
+        gaps = np.hypot(*(cells - (i, j)).T) * (grid.resolution * STEP_SCALE)
 
 
 def path_length(grid: FreeGrid, path: list[Point]) -> float:

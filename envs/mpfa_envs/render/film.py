@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.runs import Action, Driver, as_driver
+from mpfa_envs.evaluation.runs import Action, Driver, as_driver, drive_steps
 from mpfa_envs.render.traces import Panel, render_traces
 from mpfa_envs.tasks.sets import WorldTask
 
@@ -73,17 +73,17 @@ def film_episode(
     stride, step_time = 1, 0.0
     wheels: list[tuple[float, float]] = []
     seen: list[NDArray[np.float32]] = []
-    for moment in drive_episode(policy, episode, seed=seed, **env_arguments):
-        env, step, ended = moment.env, moment.step, moment.wheels is None
+    for step, drive in enumerate(drive_episode(policy, episode, seed=seed, **env_arguments)):
+        env, ended = drive.env, drive.wheels is None
         step_time = env.config.time_step * env.config.action_repeat
         if step % stride == 0 or ended:
             (snapshots[step],) = env.snapshots()
         if len(snapshots) > most and not ended:
             stride *= 2
             snapshots = {at: each for at, each in snapshots.items() if at % stride == 0}
-        seen.append(moment.observations)
-        if moment.wheels is not None:
-            wheels.append(moment.wheels)
+        seen.append(drive.observations)
+        if drive.wheels is not None:
+            wheels.append(drive.wheels)
     # Only now it is known which pictures are kept.
     pictures = {at: snapshot() for at, snapshot in snapshots.items()}
     if traces:
@@ -95,13 +95,11 @@ def film_episode(
     return Film(list(pictures.values()), step_time * stride)
 
 
-class Moment(NamedTuple):
+class EpisodeStep(NamedTuple):
     """One decision of an episode, or its end."""
 
     env: VectorNavigationEnv
     """The environment, which can render it."""
-    step: int
-    """Decisions before."""
     observations: NDArray[np.float32]
     """The observation, ``[1, O]``."""
     wheels: tuple[float, float] | None
@@ -112,24 +110,17 @@ class Moment(NamedTuple):
 
 def drive_episode(
     policy: Action | Driver, episode: WorldTask, *, seed: int = 0, **env_arguments: Any
-) -> Iterator[Moment]:
+) -> Iterator[EpisodeStep]:
     """Drive one episode; yield each decision before it is carried out, and the end."""
     arguments = {"contact": True, **getattr(policy, "env_arguments", {})}
     arguments |= episode.limit({**arguments, **env_arguments})
     arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
-    driver = as_driver(policy)
+    tasks = [episode._replace(seed=seed)]
     with closing(VectorNavigationEnv(1, **arguments)) as env:
-        observations, info = env.reset(seed=[seed], options={"tasks": [episode.task]})
-        driver.begin(env, 0)
-        step, ended = 0, False
-        while not ended:
-            actions = driver.drive(env, np.arange(1), observations)
-            wheels = env.config.robot.wheel_speeds(actions[0])
-            yield Moment(env, step, observations, wheels, info)
-            observations, _, terminated, truncated, info = env.step(actions)
-            step, ended = step + 1, bool(terminated[0] or truncated[0])
-        yield Moment(env, step, observations, None, info)
+        for observations, info, actions, _ in drive_steps(env, as_driver(policy), tasks, [0]):
+            wheels = None if actions is None else env.config.robot.wheel_speeds(actions[0])
+            yield EpisodeStep(env, observations, wheels, info)
 
 
 def panels_of(

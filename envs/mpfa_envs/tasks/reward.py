@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from mpfa_envs.checks import check_number
+from mpfa_envs.compiled import njit
 
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
@@ -59,6 +60,22 @@ RewardFunction = Callable[[StepOutcome], RewardTerms]
 """The type of the ``reward`` argument of :class:`~mpfa_envs.NavigationEnv`."""
 
 
+@njit
+def reward_terms(
+    success: bool,
+    collision: bool,
+    approach: float,  # [m]
+    payments: tuple[float, float, float, float],  # goal, collision, meter, cost of a step
+) -> tuple[float, float, float, float]:
+    """Terms of Eq. (25), the last case with its sign corrected, and the cost of a step."""
+    goal, hit, meter, cost = payments
+    if success:
+        return goal, 0.0, 0.0, 0.0
+    if collision:
+        return 0.0, hit, 0.0, 0.0
+    return 0.0, 0.0, meter * approach, -cost
+
+
 def navigation_reward(
     outcome: StepOutcome,
     *,
@@ -95,13 +112,9 @@ def navigation_reward(
         >>> round(navigation_reward(step).total, 6)
         0.2
     """
-    if outcome.success:
-        return RewardTerms(goal=goal_reward)
-    if outcome.collision:
-        return RewardTerms(collision=collision_reward)
-    # Eq. (25), last case, with its sign corrected.
-    progress = progress_scale * (outcome.previous_distance - outcome.distance)
-    return RewardTerms(progress=progress, other=-step_cost)
+    payments = float(goal_reward), float(collision_reward), float(progress_scale), float(step_cost)
+    approach = float(outcome.previous_distance - outcome.distance)
+    return RewardTerms(*reward_terms(outcome.success, outcome.collision, approach, payments))
 
 
 def resolve_reward(

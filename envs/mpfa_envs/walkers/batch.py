@@ -18,7 +18,7 @@ from mpfa_envs.walkers.loops import (
     walk,
 )
 from mpfa_envs.walkers.orca import OrcaRoom
-from mpfa_envs.worlds.arrays import grown
+from mpfa_envs.worlds.arrays import with_row
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,29 +57,29 @@ class WalkerBatch:
         """Put the walkers of a robot's world, and their circles in it, at their starts."""
         world = self._worlds[index]
         count = len(world.walkers)
-        points = max((len(each.waypoints) for each in world.walkers), default=0)
-        self._arrays = arrays = WalkerArrays(
-            **{
-                name: grown(table, *(count, points)[: 2 if name == "waypoints" else 1])
-                for name, table in self._arrays._asdict().items()
-            }
+        lengths = [len(walker.waypoints) for walker in world.walkers]
+        waypoints = np.zeros((count, max(lengths, default=0), 2))
+        for walker, length, points in zip(world.walkers, lengths, waypoints, strict=True):
+            points[:length] = np.reshape(walker.waypoints, (length, 2))
+        states, targets = starts
+        self._arrays = with_row(
+            self._arrays,
+            index,
+            states=states,
+            targets=targets,
+            slacks=np.zeros(count),
+            bodies=np.reshape([(each.radius, each.speed) for each in world.walkers], (count, 2)),
+            behaviors=[_BEHAVIORS[walker.behavior] for walker in world.walkers],
+            waypoints=waypoints,
+            waypoint_counts=lengths,
+            counts=count,
         )
-        arrays.counts[index] = count
-        self.present = bool(arrays.counts.any())
+        self.present = bool(self._arrays.counts.any())
         self._rooms.pop(index, None)
         if any(walker.behavior == "orca" for walker in world.walkers):
             self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
-        for number, walker in enumerate(world.walkers):
-            arrays.bodies[index, number] = walker.radius, walker.speed
-            arrays.behaviors[index, number] = _BEHAVIORS[walker.behavior]
-            points = len(walker.waypoints)
-            arrays.waypoint_counts[index, number] = points
-            if points:
-                arrays.waypoints[index, number, :points] = walker.waypoints
-        arrays.states[index, :count], arrays.targets[index, :count] = starts
-        arrays.slacks[index] = 0.0
         first = self._worlds.standing.counts[index, 1]
-        self._worlds.arrays.circles[index, first : first + count, :2] = starts[0][:, :2]
+        self._worlds.arrays.circles[index, first : first + count, :2] = states[:, :2]
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
         """Move the walkers for one time step."""

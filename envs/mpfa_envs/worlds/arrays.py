@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+_Arrays = TypeVar("_Arrays", bound=NamedTuple)
 
 
 class GridArrays(NamedTuple):
@@ -55,3 +56,15 @@ def grown(table: NDArray[_Scalar], *sides: int) -> NDArray[_Scalar]:
     wider: NDArray[Any] = np.zeros(wanted, dtype=table.dtype)
     wider[tuple(map(slice, shape))] = table
     return wider
+
+
+def with_row(arrays: _Arrays, robot: int, **rows: ArrayLike) -> _Arrays:
+    """The arrays with rows of a robot, each first in its row of a table that grows if it must."""
+    for name, values in rows.items():
+        row, before = np.asarray(values), getattr(arrays, name)
+        table = grown(before, *row.shape)
+        place: tuple[int | slice, ...] = (robot, *map(slice, row.shape))
+        table[place] = row
+        if table is not before:
+            arrays = arrays._replace(**{name: table})
+    return arrays

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mpfa_envs.worlds.arrays import BatchArrays, GridArrays, grown
+from mpfa_envs.worlds.arrays import BatchArrays, GridArrays, with_row
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.world import World
 
@@ -59,16 +59,10 @@ class WorldBatch:
         walkers = [(0.0, 0.0, walker.radius) for walker in world.walkers]
         if walkers:
             rows = rows._replace(circles=np.concatenate((rows.circles, walkers)))
-        self._rooms.half_sizes[robot] = rows.half_size
-        for column, name in enumerate(("boxes", "circles", "segments", "polygon_ends")):
-            count = len(getattr(rows, name))
-            table = getattr(self._rooms, name)
-            if count > table.shape[1]:
-                # More than is needed, as larger worlds may follow.
-                table = grown(table, max(count, table.shape[1] * 3 // 2))
-                self._rooms = self._rooms._replace(**{name: table})  # type: ignore[arg-type]
-            table[robot, :count] = getattr(rows, name)
-            self._rooms.counts[robot, column] = count
+        shapes = rows._asdict()
+        half_size = shapes.pop("half_size")
+        counts = [len(shape) for shape in shapes.values()]
+        self._rooms = with_row(self._rooms, robot, half_sizes=half_size, counts=counts, **shapes)
         self._standing[robot] = self._rooms.counts[robot]
         self._standing[robot, 1] -= len(walkers)
         self._worlds[robot] = world

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import math
-import zlib
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any, Final, NamedTuple
+from functools import cached_property
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,39 +137,3 @@ class OccupancyGrid:
     def __hash__(self) -> int:
         """The same in every process."""
         return int.from_bytes(self.digest[:7], "big")
-
-    @cached_property
-    def plain(self) -> dict[str, Any]:
-        """The grid as strings, numbers and lists; :meth:`from_plain` makes it again."""
-        packed = zlib.compress(np.packbits(self.occupied).tobytes())
-        return {
-            "shape": list(self.occupied.shape),
-            "resolution": self.resolution,
-            "origin": list(self.origin),
-            "cells": base64.b64encode(packed).decode(),
-        }
-
-    @staticmethod
-    def from_plain(values: dict[str, Any]) -> OccupancyGrid:
-        """Make a grid from :attr:`plain`, the same object for the same recent values."""
-        try:
-            columns, rows = (int(side) for side in values["shape"])
-            x, y = values["origin"]
-            return _unpacked(columns, rows, values["resolution"], (x, y), values["cells"])
-        except (KeyError, TypeError, zlib.error) as error:
-            raise ValueError(f"occupancy must hold the fields of a grid: {error}") from error
-
-
-@lru_cache(maxsize=8)
-def _unpacked(
-    columns: int, rows: int, resolution: float, origin: tuple[float, float], cells: str
-) -> OccupancyGrid:
-    """Make a grid; its cells are packed and compressed."""
-    if min(columns, rows) < 1 or columns * rows > MOST_CELLS:
-        raise ValueError(f"shape of the occupancy is out of its range, got {(columns, rows)}")
-    size = math.ceil(columns * rows / 8)
-    packed = zlib.decompressobj().decompress(base64.b64decode(cells), size)
-    if len(packed) != size:
-        raise ValueError(f"cells of the occupancy must be {size} bytes, got {len(packed)}")
-    bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=columns * rows)
-    return OccupancyGrid(bits.reshape(columns, rows).astype(np.bool_), resolution, origin)

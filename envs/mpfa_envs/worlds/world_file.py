@@ -13,7 +13,6 @@ import numpy as np
 import yaml
 
 from mpfa_envs.files import check_replaceable, write_atomically
-from mpfa_envs.worlds.plain import walker_to_plain
 from mpfa_envs.worlds.ros_map import read_map
 from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
 from mpfa_envs.worlds.walker import Walker
@@ -229,7 +228,15 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
             [list(vertex) for vertex in polygon.vertices] for polygon in world.polygons
         ]
     if world.walkers:
-        content["walkers"] = [walker_to_plain(walker) for walker in world.walkers]
+        content["walkers"] = [
+            {
+                "radius": float(walker.radius),
+                "speed": float(walker.speed),
+                "behavior": walker.behavior,
+                "waypoints": [list(point) for point in walker.waypoints],
+            }
+            for walker in world.walkers
+        ]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
     path, encoded = Path(path), text.encode()
     try:

@@ -12,10 +12,11 @@ from importlib.util import find_spec
 import torch
 
 from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
+from mpfa_envs.env.episodes import EpisodeSource
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
 from torchrl_mpfa.methods.registered import OF_LOSSES, SIGNALS
-from training.environments import FilteredRobots, make_training_env, task_arguments
+from training.environments import FilteredRobots, episode_arguments, task_arguments
 from training.evaluating import check_physics
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
@@ -38,10 +39,10 @@ def check_settings(settings: TrainSettings) -> None:
         group = getattr(settings, entry.name)
         if is_dataclass(group):
             check_rules(group, rules_of(type(group)), f"{entry.name}.")
-    _check_environment(settings.environment, hindsight=settings.method.hindsight > 0)
+    task = _check_environment(settings.environment, hindsight=settings.method.hindsight > 0)
     with named("environment."):
         FilteredRobots(settings)
-    _check_stages(settings)
+    _check_stages(settings, task)
     _check_evaluation(settings)
     _check_method(settings.method)
     if is_discrete(settings.learner):
@@ -55,8 +56,8 @@ def check_settings(settings: TrainSettings) -> None:
         )
 
 
-def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> None:
-    """Build the parts of the task."""
+def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> TaskConfig:
+    """Build the task and its parts."""
     with named("environment.noise."):
         RobotNoise(**asdict(environment.noise))
     with named("environment."):
@@ -65,13 +66,13 @@ def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> 
             task.make_mirror()
         if hindsight:
             GoalRelabeling(task)
+    return task
 
 
-def _check_stages(settings: TrainSettings) -> None:
+def _check_stages(settings: TrainSettings, task: TaskConfig) -> None:
     """Raise if stages count nothing or different units, or no episode begins in a world."""
-    stages = settings.curriculum.stages
-    # Wheels differ from exact arcs in nothing that is checked here, and take a server.
-    environment = replace(settings.environment, physics="kinematic")
+    stages, environment = settings.curriculum.stages, settings.environment
+    worlds = set()
     for number, stage in enumerate(stages):
         where = f"curriculum.stages[{number}]"
         if min(stage.episodes, stage.actions) != 0 or stage.length < 1:
@@ -81,11 +82,11 @@ def _check_stages(settings: TrainSettings) -> None:
             )
         if bool(stage.actions) != bool(stages[0].actions):
             raise ValueError(f"{where} must count what the others count, episodes or actions")
-        with named(f"{where}.world (environment.clearance={environment.clearance}): "):
-            env = make_training_env(stage.world, environment)
-            env.set_seed(0)
-            env.reset()
-        env.close()
+        if stage.world not in worlds:
+            with named(f"{where}.world (environment.clearance={environment.clearance}): "):
+                # It samples a task, which shows that there are some.
+                EpisodeSource(stage.world, 1, task, **episode_arguments(environment))
+            worlds.add(stage.world)
 
 
 def _check_evaluation(settings: TrainSettings) -> None:

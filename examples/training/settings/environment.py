@@ -1,11 +1,14 @@
-"""The settings of the navigation task; its parts check those that have no rule here."""
+"""The settings of the navigation task.
+
+The task itself has the defaults, and checks what has no rule here.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
 
-from mpfa_envs import TaskConfig
+from mpfa_envs import RobotNoise, TaskConfig
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE
 from training.settings.rules import at_least, between, setting
 
@@ -14,13 +17,13 @@ from training.settings.rules import at_least, between, setting
 class NoiseSettings:
     """Errors as a robot has them, in training: those of :class:`mpfa_envs.RobotNoise`."""
 
-    range_noise: float = 0.0
+    range_noise: float = RobotNoise.range_noise
     """Standard deviation of each ray of the lidar [m]."""
-    dropout: float = 0.0
+    dropout: float = RobotNoise.dropout
     """Chance that a ray reports the greatest range."""
-    slip: float = 0.0
+    slip: float = RobotNoise.slip
     """Mean share of its path that a wheel loses, up to 0.45."""
-    drift: float = 0.0
+    drift: float = RobotNoise.drift
     """Standard deviation of the share of the error of odometry in distances, and in turns."""
 
 
@@ -28,29 +31,29 @@ class NoiseSettings:
 class EnvironmentSettings:
     """The navigation task."""
 
-    robot: Any = "turtlebot2"
+    robot: Any = TaskConfig.robot.name
     """``turtlebot2``, the paper's, which can neither stop nor reverse; ``kobuki``, the same body
     with its real wheels, ``turtlebot4``, ``burger`` or ``waffle``; or the path of a YAML file of
     your own (``docs/howto/robot.md``), whose values a run keeps in its place."""
-    physics: str = "wheels"
+    physics: str = TaskConfig.physics
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int | None = None
     """Time limit of an episode [0.1 s]; null: the time in which the robot drives 105 m at full
     speed, as in evaluations."""
-    action_repeat: int | None = 2
+    action_repeat: int | None = TaskConfig.action_repeat
     """Time steps of 0.1 s for which an action is held. DDPG is less reliable with one
     (``docs/tuning.md``). Null: the time in which the robot drives 0.14 m at full speed, at least
     0.2 s."""
-    progress_scale: float = setting(5.0, NOT_NEGATIVE)
+    progress_scale: float = setting(TaskConfig.progress_scale, NOT_NEGATIVE)
     """eps_p of Eq. 25, not given in the paper. With 15 robots circle near the goal."""
     step_cost: float = setting(0.0, NOT_NEGATIVE)
     """Cost of a time step of 0.1 s, for robots that can stand still."""
-    clearance: float = setting(0.07, NOT_NEGATIVE)
+    clearance: float = setting(TaskConfig.clearance, NOT_NEGATIVE)
     """Clearance below which training counts a collision [m]. With 0.17 m a passage of 0.9 m has
     0.2 m left to drive in."""
-    detour_chance: float = 0.8
+    detour_chance: float = TaskConfig.detour_chance
     """Chance that a task must have an obstacle between start and goal."""
-    progress: str = "straight_line"
+    progress: str = TaskConfig.progress
     """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or ``none``:
     goal and collision alone."""
     goal_radius: float = setting(TaskConfig.goal_radius, between(0.1, 1.5, "from 0.1 to 1.5 [m]"))
@@ -59,13 +62,13 @@ class EnvironmentSettings:
     """Longest path of a sampled task [m]; null: no limit."""
     episodes_per_world: int = setting(1, at_least(1))
     """Episodes of a robot in a world of a generator."""
-    memory: str = "none"
+    memory: str = TaskConfig.memory
     """``map``: the robot observes the path to the goal on a map of its lidar's hits; ``none``: the
     current scan alone."""
-    plan: str = "unknown"
+    plan: str = TaskConfig.plan
     """``known``: the robot's map begins with all obstacles and walls that stand; ``unknown``: it
     begins empty. A policy that learned without a plan drives with it as well."""
-    history: int = setting(0, at_least(0))
+    history: int = setting(TaskConfig.history, at_least(0))
     """Earlier scans in the observation, which show what moves."""
     field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))
     """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own."""

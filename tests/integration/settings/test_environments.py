@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +172,6 @@ def test_the_ids_are_the_tasks_that_the_regimes_learn(
 
 
 def test_the_settings_of_noise_are_those_of_the_environment() -> None:
-    assert asdict(NoiseSettings()) == asdict(RobotNoise())
     settings = EnvironmentSettings(
         physics="kinematic", noise=NoiseSettings(slip=0.1), latency=[0.0, 0.2]
     )
