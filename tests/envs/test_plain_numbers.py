@@ -49,7 +49,7 @@ def test_state_of_an_environment_with_numbers_of_numpy_has_none():
         goal_radius=np.float32(0.5),
         max_goal_distance=np.float32(9),
     )
-    env.reset(seed=int(ONE), options={"worlds": [world, None]})
+    env.reset(seed=int(ONE))
     assert numbers_of_numpy(env.state_dict()) == []
     env.close()
 

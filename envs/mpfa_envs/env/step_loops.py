@@ -9,7 +9,7 @@ import numpy as np
 
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
-from mpfa_envs.tasks.reward import reward_terms
+from mpfa_envs.tasks import reward
 from mpfa_envs.worlds.clearance_loops import clearance_at
 
 if TYPE_CHECKING:
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from mpfa_envs.paths.batch import FieldArrays
     from mpfa_envs.worlds.arrays import BatchArrays
+
+# Compiled here: the package's first import knows the function without Numba.
+reward_terms = njit(reward.reward_terms)
 
 # Rows of the tables of a batch: the keys of the info dictionary in their order.
 SUCCESS: Final = 0

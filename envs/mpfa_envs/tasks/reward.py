@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from mpfa_envs.checks import check_number
-from mpfa_envs.compiled import njit
 
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
@@ -60,7 +59,6 @@ RewardFunction = Callable[[StepOutcome], RewardTerms]
 """The type of the ``reward`` argument of :class:`~mpfa_envs.NavigationEnv`."""
 
 
-@njit
 def reward_terms(
     success: bool,
     collision: bool,
