@@ -257,3 +257,46 @@ def test_predictive_control_needs_the_map_of_its_robot() -> None:
         "memory": "map",
         "robot": ROBOTS["kobuki"],
     }
+
+
+def test_the_seed_decides_the_samples_and_nothing_else_does() -> None:
+    first, again, other = (PredictiveControl(robot="kobuki", seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first._noise, again._noise)
+    assert not np.array_equal(first._noise, other._noise)
+
+
+def test_a_robot_plans_from_where_its_odometry_places_it_and_behind_the_filter() -> None:
+    planner = PredictiveControl(robot="kobuki")
+    task: dict[str, Any] = {"robot": "kobuki", "physics": "kinematic", "memory": "map"}
+    env = VectorNavigationEnv(1, world="D", noise={"drift": 0.3}, goal_radius=0.3, **task)
+    seen, _ = env.reset(seed=0)
+    planner.begin(env, 0)
+    robots = np.zeros(1, np.int64)
+    for _ in range(12):
+        seen, *_ = env.step(planner.drive(env, robots, seen))
+    scene = planner._scene(env, 0, seen[0])
+    assert env.maps is not None
+    place = np.array(scene.pose[:2]) + env.maps.origins[0]
+    assert math.dist(place, env.moments[0, 4:6]) < 1e-9 < math.dist(place, env.poses[0, :2])
+    assert scene.goal[2] == pytest.approx(0.94 * 0.3)
+    kept = planner._keep
+    calls: list[int] = []
+
+    def count(*arguments: Any) -> Any:
+        calls.append(1)
+        return kept(*arguments)
+
+    count.seen = kept.seen  # type: ignore[attr-defined]
+    planner._keep = count  # type: ignore[assignment]
+    planner.drive(env, robots, seen)
+    assert calls
+    env.close()
+
+
+def test_a_last_plan_is_tried_again_from_the_moment_of_now() -> None:
+    plan = np.linspace(0.0, 0.7, STEPS)[:, None].repeat(2, axis=1)
+    expected = np.concatenate((plan[2:], plan[-1:], plan[-1:]))
+    expected[:2] = expected[0]
+    nothing = np.empty((0, 2)), np.empty((0, 0, 4, 2))
+    best_plan(plan, *nothing, scene(), BODY._replace(repeat=2), EFFORT)
+    np.testing.assert_array_equal(plan, expected)

@@ -355,20 +355,18 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
     def _describe(self) -> dict[str, Any]:
         """Plain values by name: the arguments that decide what happens next."""
-        return {
-            "num_envs": self.num_envs,
-            **self.config.describe(),
-            **self._source.describe(),
-            "autoreset_mode": self.autoreset_mode.value,
-        }
+        own = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
+        return {**own, **self.config.describe(), **self._source.describe()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state from which another environment can continue these episodes.
 
         Returns:
-            Plain values and arrays: for each robot the state of its source of randomness where its
-            episode began, the name of a world that it keeps, and the actions since. ValueError if
-            the options of a reset gave an episode its world or task.
+            Plain values and arrays: for each robot the random state where its episode began, the
+            name of a world that it keeps, and the actions since.
+
+        Raises:
+            ValueError: If the options of a reset gave an episode its world or task.
         """
         robots = range(self.num_envs) if self._begun else ()
         begins, driven = self._source.begins, self._batch.driven
