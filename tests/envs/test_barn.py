@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 import mpfa_envs
 from mpfa_envs import (
-    NavigationEnv,
     WorldFileError,
     evaluate,
     load_policy,
@@ -20,7 +18,6 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.results import barn_score
-from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world, barn_worlds, load_barn
 
@@ -54,16 +51,6 @@ def test_the_task_can_be_solved_with_something_to_spare(index: int) -> None:
     assert 9.8 < field.at(*task.start[:2]) < 15.0
     i, j = field.grid.index(*task.start[:2])
     assert math.isfinite(field.lengths[i, j])
-
-
-def test_a_world_is_found_by_its_name() -> None:
-    world = resolve_world("barn-12")
-    assert world == barn_world(12) and world.name == "barn-12"
-    env = NavigationEnv(world="barn-0", physics="kinematic")
-    _, info = env.reset(options=barn_task()._asdict())
-    assert info["distance"] == 10.0 and info["heading"] == pytest.approx(math.pi / 2)
-    _, info = env.reset(seed=0)
-    assert info["y"] < -2.5 and env.task is not None and env.task.goal[1] > 3.5
 
 
 def publish(folder: Path, indices: Iterable[int] = (0, 7), worlds: str = "world_files") -> Path:
@@ -103,25 +90,6 @@ def test_the_archive_has_the_worlds_and_paths_that_come_with_the_package(
         places = [(c.x, c.y, c.radius) for c in world.cylinders]
         wanted = [(c.x, c.y, c.radius) for c in expected.cylinders]
         assert np.array(places) == pytest.approx(np.array(wanted), abs=1e-3)
-
-
-@pytest.mark.parametrize("index", range(20))
-def test_a_reference_path_leads_between_the_cylinders_from_the_start_to_the_goal(
-    index: int,
-) -> None:
-    """The formula of the benchmark's own script, cell by cell."""
-    number, radius = BARN_WORLDS[index], 0.075
-    with np.load(SAMPLE, allow_pickle=False) as sample:
-        cells, cylinders = sample[f"path_{number}"], sample[f"cyl_{number}"]
-    points = [(-2.25, 3.0)]
-    for column, row in cells.tolist():
-        points.append(
-            (column * 2 * radius - radius - 30 * 2 * radius, row * 2 * radius + radius + 5)
-        )
-        assert min(math.dist(points[-1], other) for other in cylinders.tolist()) > 0.3
-    points.append((-2.25, 13.0))
-    steps = list(pairwise(points))
-    assert list(barn_worlds())[index][1] == pytest.approx(sum(math.dist(*step) for step in steps))
 
 
 def test_the_task_of_an_archive_is_driven_and_scored(tmp_path: Path) -> None:

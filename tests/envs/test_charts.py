@@ -11,19 +11,10 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from mpfa_envs.render import LINES, plot_histograms, plot_seeds
+from mpfa_envs.render import plot_histograms, plot_seeds
 from mpfa_envs.render.charts import first_step, looks, seed_band
-from mpfa_envs.scene.colors import METHODS as COLORS
-from torchrl_mpfa.methods import ALIASES, METHODS
 
 STEPS = np.arange(0, 101, 10)
-
-
-def colored(path: Path, color: tuple[int, ...], *, spread: int = 12) -> np.ndarray:
-    """Pixels of a picture with about this color, shape ``[height, width]``."""
-    with Image.open(path) as picture:
-        found = np.asarray(picture.convert("RGB")).astype(int)
-    return (abs(found - color) <= spread).all(-1)
 
 
 def test_a_band_is_the_interval_of_the_mean_of_runs() -> None:
@@ -63,22 +54,6 @@ def test_a_mean_spans_the_steps_that_all_runs_have() -> None:
 def test_a_level_is_reached_when_it_first_is() -> None:
     assert first_step(([10, 20, 30], [0.2, 0.9, 0.1]), 0.9) == 20
     assert first_step(([10, 20], [0.2, 0.8]), 0.9) == np.inf
-
-
-def test_the_median_of_the_runs_is_marked_on_the_level(tmp_path: Path) -> None:
-    steps = np.arange(0, 101)
-    curves = [(steps, (steps >= at) * 1.0) for at in (20, 50, 80)]
-    path = tmp_path / "seeds.png"
-    plot_seeds({"one": curves}, path)
-    plot_seeds({"one": curves}, tmp_path / "plain.png", level=None)
-    marks = colored(path, LINES[0]) & ~colored(tmp_path / "plain.png", LINES[0], spread=60)
-    rows, columns = np.nonzero(marks[: marks.shape[0] // 3])
-    # Ticks of three runs and the triangle of the median, on the line at nine tenths.
-    assert len(rows) > 60
-    width = marks.shape[1]
-    groups = 1 + (np.diff(np.unique(columns)) > 0.1 * width).sum()
-    assert groups == 3
-    assert abs(np.median(columns) / width - 0.54) < 0.06
 
 
 def test_a_few_runs_are_lines_without_a_band(tmp_path: Path) -> None:
@@ -128,12 +103,3 @@ def test_a_method_has_its_color_and_another_arm_of_it_another_dash() -> None:
     red, green, blue = (styles["uniform replay"]["color"][start : start + 2] for start in (1, 3, 5))
     assert red == green == blue
     assert looks(["DDPG + RAdam"], {"DDPG + RAdam": "ddpg_radam"}) != looks(["DDPG + RAdam"])
-
-
-def test_every_replay_method_has_a_look_of_its_own() -> None:
-    named = {name: ALIASES.get(name, name) for name in METHODS}
-    styles = looks(named, named)
-    assert set(named.values()) <= set(COLORS)
-    assert len({tuple(styles[name].values()) for name in named.values()}) == len(
-        set(named.values())
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,9 +42,7 @@ def size_of(arguments: dict[str, Any]) -> int:
     [
         {},
         {"history": 3, "robot": "burger"},
-        {"memory": "map"},
         {"lidar": {"field_of_view": 360.0, "sectors": 36}, "memory": "map"},
-        {"lidar": {"field_of_view": 110.0}},
         {"lidar": {"reduction": "median", "rays_per_sector": 4, "sectors": 9}},
         {"lidar": {"reduction": "single", "max_range": 3.0}, "memory": "map", "history": 1},
     ],
@@ -68,8 +65,7 @@ def test_it_senses_what_the_environment_senses(tmp_path: Path, arguments: dict[s
     env.close()
 
 
-@pytest.mark.parametrize("latency", [0.1, 0.26])
-@pytest.mark.parametrize("memory", ["none", "map"])
+@pytest.mark.parametrize(("latency", "memory"), [(0.1, "none"), (0.26, "map")])
 def test_with_late_orders_it_senses_what_the_environment_senses(
     tmp_path: Path, latency: float, memory: str
 ) -> None:
@@ -240,18 +236,6 @@ print(pilot.decide(Scan(-3.1, 0.01, [2.0] * 620), (0.0, 0.0, 0.0), (0.0, 0.0)))
     assert found.startswith("Command(left=0.")
 
 
-def test_a_decision_takes_a_few_milliseconds_at_most(tmp_path: Path) -> None:
-    pilot = Pilot.load(exported(tmp_path))
-    pilot.begin((3.0, 1.0))
-    scan = Scan(-math.pi, math.pi / 360, np.random.default_rng(0).uniform(0.5, 5.0, 720))
-    times = []
-    for _ in range(50):
-        start = time.perf_counter()
-        pilot.decide(scan, (0.0, 0.0, 0.0), (0.3, 0.0))
-        times.append(time.perf_counter() - start)
-    assert sorted(times)[10] < 5e-3
-
-
 def test_bad_numbers_are_rejected_by_name(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path))
     scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
@@ -302,21 +286,3 @@ def test_a_wheel_is_not_ordered_below_its_least_speed(slowest: float) -> None:
     able.begin((3.0, 1.0))
     command = able.decide(scan, (0.0, 0.0, 0.0), (0.1, 0.0))
     assert command.linear == 0.0 and command.left == -command.right
-
-
-@pytest.mark.parametrize(
-    ("pose", "speeds", "text"),
-    [
-        ((2000.0, 1500.0, 0.0), (0.3, 0.0), "goal must be on the map, 2000 m around"),
-        ((0.0, 0.0, 0.0), (300.0, 0.0), "speeds must be at most 20 m/s and rad/s in size, got 300"),
-        ((0.0, 0.0, 0.0), (0.1, 80.0), "speeds must be at most 20 m/s and rad/s in size, got 80"),
-    ],
-)
-def test_odometry_in_another_unit_is_rejected(
-    pose: tuple[float, float, float], speeds: tuple[float, float], text: str
-) -> None:
-    pilot = in_place(card(), -0.5)
-    pilot.begin((3.0, 1.0))
-    scan = Scan(-math.pi, math.pi / 180, np.full(360, 3.0))
-    with pytest.raises(ValueError, match=text):
-        pilot.decide(scan, pose, speeds)

@@ -104,13 +104,6 @@ def test_orders_change_no_faster_than_the_policy_knows() -> None:
     assert at_once.ramp((0.0, 0.0), (0.5, 1.0), 0.0) == (0.5, 1.0)
 
 
-def test_orders_change_no_faster_than_a_controller_allows_that_limits_both_speeds_apart() -> None:
-    robot = replace(KOBUKI, name="own", turn_acceleration=2.0)
-    own = a_pilot((1.0, 1.0), robot=robot)
-    assert own.ramp((0.4, 0.0), (0.0, 1.0), 0.05) == pytest.approx((0.36, 0.1))
-    assert own.ramp((0.4, 0.0), (0.4, 1.0), 0.05) == pytest.approx((0.4, 0.1))
-
-
 @pytest.mark.parametrize("clearance", [None, 0.03])
 @pytest.mark.parametrize(
     ("half", "action", "drives"),
@@ -143,14 +136,6 @@ def test_a_filter_of_a_robot_that_sees_too_little_is_rejected(view: float) -> No
     with pytest.raises(ValueError, match=f"field_of_view must be at least 180 .* got {view:.0f}"):
         a_pilot((0.5, 0.5), robot=narrow, clearance=0.03)
     assert not a_pilot((0.5, 0.5), robot=narrow).has_filter
-
-
-@pytest.mark.parametrize("clearance", [None, 0.03])
-def test_a_body_that_does_not_reverse_turns_on_the_spot(clearance: float | None) -> None:
-    forwards = replace(KOBUKI, reverse=False)
-    pilot = a_pilot((-0.7, -0.5), robot=forwards, clearance=clearance)
-    command = pilot.decide(wall_at(3.0), (0.0, 0.0, 0.0), (0.0, 0.0))
-    assert command[2:] == pytest.approx((0.0, 0.7 * 0.2 / 0.23))
 
 
 def test_a_robot_that_cannot_stop_has_no_filter() -> None:

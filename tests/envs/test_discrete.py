@@ -38,25 +38,6 @@ def test_the_specs_of_the_transformed_environment_hold(num_envs):
     env.close()
 
 
-@pytest.mark.parametrize("place", range(len(WHEEL_PAIRS)))
-def test_a_choice_drives_as_its_wheel_speeds(place):
-    plain, discrete = (
-        NavigationTorchEnv(num_envs=2, world="A", physics="kinematic") for _ in range(2)
-    )
-    discrete = TransformedEnv(discrete, DiscreteWheels())
-    seen = []
-    choice = torch.nn.functional.one_hot(torch.tensor([place, 0]), len(WHEEL_PAIRS))
-    speeds = torch.tensor([WHEEL_PAIRS[place], WHEEL_PAIRS[0]])
-    for env, action in ((plain, speeds), (discrete, choice)):
-        env.set_seed(5)
-        state = env.reset()
-        for _ in range(3):
-            state = env.step(state.set("action", action))["next"]
-        seen.append(state["observation"])
-        env.close()
-    assert torch.equal(*seen)
-
-
 NUMBERS = torch.tensor([5, 2])
 HOT = torch.nn.functional.one_hot(NUMBERS, len(WHEEL_PAIRS))
 SOFT = torch.full((2, len(WHEEL_PAIRS)), 1.0 / len(WHEEL_PAIRS))
@@ -104,23 +85,6 @@ def test_actions_of_another_width_are_neither_mirrored_nor_driven(width):
     with pytest.raises(ValueError, match=r"action must have shape \[2, 2\]"):
         env.step(state)
     env.close()
-
-
-def test_a_mirrored_choice_has_its_wheels_swapped():
-    choices = torch.eye(len(WHEEL_PAIRS), dtype=torch.long)
-    mirrored = Mirror(pairs=WHEEL_PAIRS).action(choices).argmax(-1).tolist()
-    assert [WHEEL_PAIRS[place] for place in mirrored] == [(b, a) for a, b in WHEEL_PAIRS]
-    rows = TensorDict(
-        {
-            "observation": torch.rand(7, 24),
-            "action": choices,
-            "next": {"observation": torch.rand(7, 24)},
-        },
-        [7],
-    )
-    found = RandomMirror(chance=1.0, pairs=WHEEL_PAIRS)(rows.clone())
-    assert found["action"].argmax(-1).tolist() == mirrored
-    assert found["action"].dtype == torch.long
 
 
 def test_a_cell_is_that_of_a_plain_loop():

@@ -11,7 +11,7 @@ from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.paths.lengths import is_reachable
-from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
+from mpfa_envs.paths.tasks import sample_task_on_grid
 
 MIXED = World(
     name="mixed",
@@ -23,7 +23,6 @@ MIXED = World(
         Polygon(((2.0, -1.8), (3.0, -1.8), (2.4, -0.9))),
     ),
 )
-DOOR = World(name="door", boxes=(Box(-0.2, -5.0, 0.2, -0.4), Box(-0.2, 0.4, 0.2, 5.0)))
 CUT = World(name="cut", boxes=(Box(-0.2, -5.0, 0.2, 5.0),))
 
 
@@ -87,16 +86,6 @@ def test_lengths_of_a_field_are_those_of_plain_dijkstra_to_the_bit(world: World)
     np.testing.assert_array_equal(near, np.where(values <= 3.0, values, math.inf))
 
 
-def test_a_path_leads_around_a_wall_but_not_a_closed_one() -> None:
-    goal = (3.0, 3.0)
-    field = DistanceField(FreeGrid(DOOR, distance=0.3), goal)
-    # Two straight lines to the doorway, and one through it.
-    assert field.at(-3.0, 3.0) == pytest.approx(2 * math.hypot(2.7, 2.9) + 0.6, rel=0.03)
-    cut = DistanceField(FreeGrid(CUT, distance=0.3), goal)
-    i, j = cut.grid.index(-3.0, 3.0)
-    assert cut.lengths[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
-
-
 def test_a_field_up_to_a_position_has_the_lengths_that_a_path_from_there_needs() -> None:
     grid, goal = FreeGrid(MIXED, distance=0.2), (-0.5, 2.0)
     whole = DistanceField(grid, goal)
@@ -154,12 +143,6 @@ def test_positions_are_read_bilinearly() -> None:
     assert field.at(x + 0.03, y + 0.04) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_goal_off_the_free_cells_is_reached_from_the_nearest() -> None:
-    field = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (0.0, 3.75))
-    i, j = field.grid.index(0.0, 3.2)
-    assert field.lengths[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
-
-
 def test_tasks_keep_regions_distances_and_clearances() -> None:
     world = World(
         name="sides",
@@ -200,18 +183,3 @@ def test_a_task_lies_on_one_side_of_a_closed_wall() -> None:
         for _ in range(20):
             task, _ = sample_task_on_grid(CUT, rng, distance=0.25, detour_chance=chance)
             assert task.start[0] * task.goal[0] > 0.0
-
-
-def test_the_same_generator_gives_the_same_task() -> None:
-    tasks = [
-        sample_task_on_grid(WORLDS["D"], np.random.default_rng(5), distance=0.25)[0]
-        for _ in range(2)
-    ]
-    assert tasks[0] == tasks[1]
-
-
-def test_has_task_knows_worlds_without_a_task() -> None:
-    assert has_task(FreeGrid(CUT, distance=0.25))
-    assert not has_task(FreeGrid(World(name="closet", size=(2.2, 2.2)), distance=0.25))
-    walls = tuple(Box(x, -1.5, x + 0.1, 1.5) for x in (-1.0, -0.4, 0.2, 0.8))
-    assert has_task(FreeGrid(World(name="lanes", size=(3.0, 3.5), boxes=walls), distance=0.25))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mpfa_envs import ROBOTS, WORLDS, Box, VectorNavigationEnv, World, world_tasks
-from mpfa_envs.tasks.doors import is_built_in
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.task import Task
@@ -69,19 +68,6 @@ def test_parts_that_cannot_be_reached_are_said_once(kind: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         world_tasks(two_rooms(0.72, kind), episodes=1, robot=CART)
-
-
-def test_worlds_with_a_name_are_no_worlds_of_ones_own() -> None:
-    known = ["A", "test", "rooms-7", "bars-test-2", "mazes-3@0.5", "barn-7", "crowd-2"]
-    worlds = [world_tasks(name, episodes=1)[0].world for name in known]
-    assert [is_built_in(world) for world in worlds] == [True] * len(known)
-    own = [
-        replace(worlds[0], name="test"),
-        World(name="barn-3"),
-        World(name="rooms-7"),
-        World(name="A", size=(9.0, 9.0)),
-    ]
-    assert [is_built_in(world) for world in own] == [False] * 4
 
 
 def test_tasks_of_the_paper_keep_its_clearance() -> None:

@@ -91,12 +91,6 @@ def test_a_file_replaces_only_its_own_kind_without_overwrite(
     assert path.read_bytes() == written != content.encode()
 
 
-def test_a_link_to_nothing_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / "policy.npz").symlink_to(tmp_path / "later")
-    with pytest.raises(FileExistsError, match="path must be free or hold a policy"):
-        save_policy(POLICY, tmp_path)
-
-
 @pytest.mark.parametrize(
     "content", [b"", b"junk", b"P5 10 10 255\n", b"PK\x03\x04junk", b"\x93NUMPY"]
 )

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from mpfa_envs import Box, NavigationEnv, WorldFileError
+from mpfa_envs import NavigationEnv, WorldFileError
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.worlds.barn import barn_task, barn_world
 from mpfa_envs.worlds.gazebo import load_gazebo_world
@@ -152,21 +152,6 @@ def test_a_bad_file_is_rejected_with_line_and_reason(content, line, reason, tmp_
     assert f"room.world:{line}: " in str(caught.value)
 
 
-@pytest.mark.parametrize("encoding", ["foo", "utf-7", "idna", "hex"])
-def test_an_unknown_encoding_is_rejected(encoding, tmp_path):
-    path = write(tmp_path, model(CYLINDER))
-    path.write_text(path.read_text().replace("?>", f" encoding='{encoding}'?>"))
-    with pytest.raises(WorldFileError, match=r"room.world:1: is not XML"):
-        load_gazebo_world(path)
-
-
-def test_a_compressed_file_of_line_ends_is_read_soon(tmp_path):
-    path = write(tmp_path, model(CYLINDER) + "\n" * 1_000_000, name="room.world.gz")
-    start = time.process_time()
-    assert len(load_gazebo_world(path, size=(2.0, 2.0)).cylinders) == 1
-    assert time.process_time() - start < 2.0
-
-
 def test_entities_are_rejected_before_they_grow(tmp_path):
     head = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;&a;">]>\n'
     with pytest.raises(WorldFileError, match="must not have a document type"):
@@ -231,30 +216,6 @@ def test_what_lies_under_everything_else_is_the_floor(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "boxes"),
-    [
-        (box(0, 0, 2.55, "11 11 0.1") + box(0, 0, 3, "1 1 1"), 4),  # A roof with a chimney.
-        (box(0, 0, 0.2, "9.2 9.2 0.4") + box(0, 0, 0.6, "1 1 0.3"), 6),  # A ring of corridors.
-        (box(2, 2, 0.2, "1 1 0.4") + box(2, 2, 0.6, "0.3 0.3 0.4"), 6),  # A vase on a table.
-        (box(-2, 0, 0.2, "5.8 9.8 0.4") * 2, 6),  # One half of the room, twice.
-        (box(0, 0, -1, "30 30 0.5") + box(2, 2, 0.2, "1 1 0.4"), 5),  # A slab that is buried.
-        (model("<plane/>", "0 0 3 3.14159 0 0") + box(0, 0, 3.5, "1 1 1"), 4),  # A ceiling.
-    ],
-)
-def test_what_lies_over_or_beside_other_things_is_no_floor(content, boxes, tmp_path):
-    world = load_gazebo_world(write(tmp_path, walls() + content), size=(12, 12), center=(0, 0))
-    assert Box(-5.0, 4.9, 5.0, 5.1) in world.boxes
-    assert len(world.boxes) == boxes
-
-
-def test_a_pedestal_in_a_hall_is_no_floor(tmp_path):
-    content = box(0, 0, 0.2, "2 2 0.4") + box(0, 0, 0.7, "0.2 0.2 0.6")
-    assert len(load_gazebo_world(write(tmp_path, content), size=(10, 10)).boxes) == 2
-    with pytest.raises(ValueError, match=r"size must be two positive lengths, got .'wide', 10"):
-        load_gazebo_world(write(tmp_path, content), size=("wide", 10))
-
-
-@pytest.mark.parametrize(
     ("geometry", "turn", "bounds"),
     [
         ("<box><size>1 2 3</size></box>", f"{math.pi / 2} 0 0", (1, 3)),
@@ -292,15 +253,6 @@ def test_an_upright_plane_that_is_turned_is_a_wall(tmp_path):
     assert world.polygons[0].area == pytest.approx(2.8 * 0.01)
 
 
-def test_turns_are_judged_after_composing(tmp_path):
-    inner = model("<box><size>1 2 3</size></box>", "0 0 1 -0.4 0 0", static="")
-    outer = f"<model name='o'><static>1</static><pose>1 1 0 0.4 0 0</pose>{inner}</model>"
-    world, told = quietly(write(tmp_path, walls() + outer), center=(0, 0))
-    assert not told
-    # The inner model is a meter along the tilted axis.
-    assert world.boxes[4].bounds == pytest.approx((0.5, -math.sin(0.4), 1.5, 2 - math.sin(0.4)))
-
-
 def test_the_state_of_the_file_scales_models(tmp_path):
     state = "".join(
         f"<model name='{name}'><pose>2 2 0.5 0 0 {yaw}</pose><scale>{scale}</scale></model>"
@@ -311,15 +263,6 @@ def test_the_state_of_the_file_scales_models(tmp_path):
     world = load_gazebo_world(path, center=(0, 0))
     assert world.boxes[4].bounds == pytest.approx((0.5, 1.5, 3.5, 2.5))
     assert world.cylinders[0].radius == pytest.approx(0.3)
-
-
-def test_a_state_has_nested_models_in_the_frame_of_the_world(tmp_path):
-    nested = box(1, 0, 0.5, "1 1 1", name="b").replace("<static>1</static>", "")
-    outer = f"<model name='o'><static>1</static><pose>3 3 0 0 0 0</pose>{nested}</model>"
-    inner = "<model name='b'><pose>-2 -2 0.5 0 0 0</pose><scale>2 1 1</scale></model>"
-    state = f"<state><model name='o'><pose>1 1 0 0 0 0</pose>{inner}</model></state>"
-    world = load_gazebo_world(write(tmp_path, walls() + outer + state), center=(0, 0))
-    assert world.boxes[4].bounds == (-3.0, -2.5, -1.0, -1.5)
 
 
 def test_collisions_in_unknown_places_are_counted(tmp_path):
@@ -370,20 +313,6 @@ def test_marks_without_an_end_are_rejected_soon(text, tmp_path):
     with pytest.raises(WorldFileError, match="is not XML"):
         load_gazebo_world(tmp_path / "a.world")
     assert time.process_time() - start < 2.0
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '# a yard\ninclude "cart.inc"\nfloorplan\n(\n  bitmap "yard.png"\n)\n',
-        "define block model\n(\n  size [1 1 1]\n)\n",
-        "window ( size [600 600] )\nposition(pose [0 0 0 0])\n",
-    ],
-)
-def test_a_world_of_stage_is_called_by_name(tmp_path, text):
-    (tmp_path / "yard.world").write_text(text)
-    with pytest.raises(WorldFileError, match=r"is a world of Stage, .* as a ROS map"):
-        resolve_world(tmp_path / "yard.world")
 
 
 @pytest.mark.parametrize("text", ["plain text", "(", "<sdf>(</sdf", "a: (b)"])

@@ -4,7 +4,7 @@ import hashlib
 import math
 import random
 from collections import Counter
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -25,7 +25,6 @@ from mpfa_envs import (
 from mpfa_envs.generators.generate import generator_tasks, split_worlds, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.lengths import is_reachable
 from mpfa_envs.paths.tasks import sample_task_on_grid
 
 NAMES = list(GENERATORS)
@@ -56,7 +55,7 @@ def fingerprint(world: World) -> str:
 def test_a_task_is_found_in_each_of_many_worlds(name: str) -> None:
     rng = np.random.default_rng(0)
     for split in ("train", "validation", "test"):
-        for index in range(20):
+        for index in range(6):
             world = generate_world(name, world_seed(split, 100 + index))
             grid = FreeGrid(world, distance=0.25)
             task, field = sample_task_on_grid(grid, rng, detour_chance=0.8)
@@ -64,22 +63,6 @@ def test_a_task_is_found_in_each_of_many_worlds(name: str) -> None:
             # A path over free cells, and 0.07 m to spare for a robot of 0.18 m.
             assert math.isfinite(field.lengths[grid.index(*task.start[:2])]), world.name
             assert min(world.clearance(*task.start[:2]), world.clearance(*task.goal)) > 0.2499
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_task_has_a_path(name: str) -> None:
-    pairs = generator_tasks(name, "validation", worlds=3, tasks=2)
-    assert len(pairs) == 6 and len({world.name for world, _ in pairs}) == 3
-    for world, task in pairs:
-        assert is_reachable(world, 0.24, task.start[:2], task.goal), world.name
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_seed_is_one_world_and_another_seed_another(name: str) -> None:
-    worlds = [generate_world(name, seed) for seed in range(20)]
-    assert worlds == [generate_world(name, seed) for seed in range(20)]
-    assert len({fingerprint(world) for world in worlds}) == 20
-    assert [world.name for world in worlds] == [f"{name}-{seed}" for seed in range(20)]
 
 
 @pytest.mark.parametrize(("name", "expected"), PINNED.items())
@@ -117,7 +100,10 @@ def test_splits_share_no_seed_and_no_world() -> None:
 @pytest.mark.parametrize(
     ("name", "ending"),
     [
-        *product(NAMES, ("7", "validation-7", "test-7", "7@0.25", "test-3@1", "0@0")),
+        *(
+            ("bars", ending)
+            for ending in ("7", "validation-7", "test-7", "7@0.25", "test-3@1", "0@0")
+        ),
         ("mazes", "7@0.0000001"),
         ("mazes", "7@0.3333333333333333"),
     ],
@@ -140,9 +126,9 @@ def test_difficulty_means_more_obstacles(name: str) -> None:
     def free_share(difficulty: float) -> float:
         grids = [
             FreeGrid(generate_world(name, seed, difficulty=difficulty), distance=0.25)
-            for seed in range(20)
+            for seed in range(12)
         ]
-        return sum(grid.free.mean() for grid in grids) / 20
+        return sum(grid.free.mean() for grid in grids) / 12
 
     shares = [free_share(difficulty) for difficulty in (0.0, 0.5, 1.0)]
     assert shares[0] > shares[1] > shares[2]
@@ -209,14 +195,6 @@ def test_every_place_of_a_maze_can_be_reached(difficulty: float) -> None:
     assert np.mean(wider) < (0.3 if difficulty == 1.0 else 0.75)
 
 
-def test_hard_mazes_have_dead_ends_and_easy_ones_detours() -> None:
-    def walls(difficulty: float) -> float:
-        worlds = [generate_world("mazes", seed, difficulty=difficulty) for seed in range(10)]
-        return sum(w.covered_area / (w.size[0] * w.size[1]) for w in worlds)
-
-    assert walls(1.0) > 1.5 * walls(0.0)
-
-
 def test_a_field_has_a_path_from_end_to_end() -> None:
     counts = []
     for seed in range(40):
@@ -245,14 +223,6 @@ def test_halls_are_up_to_20_m_with_obstacles_at_any_angle() -> None:
     angles = [math.atan2(y1 - y0, x1 - x0) for x0, y0, x1, y1 in (p.edges[0] for p in polygons)]
     assert all(sum(low < a <= low + 0.8 for a in angles) > 20 for low in np.arange(-3.1, 2.4, 0.8))
     assert any(world.cylinders for world in worlds)
-
-
-def test_bars_meet_and_make_pockets() -> None:
-    meeting = 0
-    for seed in range(10):
-        boxes = generate_world("bars", seed, difficulty=0.5).boxes
-        meeting += sum(gap(a, b) == 0.0 for a, b in combinations(boxes, 2))
-    assert meeting > 60
 
 
 def test_mixed_worlds_are_of_all_kinds() -> None:
@@ -299,13 +269,6 @@ def test_a_registered_generator_works_like_a_built_in_one() -> None:
     assert all(name.startswith("pillars-") for name in names)
     ahead = evaluate(lambda _: np.ones(2), "pillars:test", episodes=2, physics="kinematic")
     assert [result.world for result in ahead] == ["pillars-test-0", "pillars-test-0"]
-
-
-def test_a_registered_generator_may_be_replaced() -> None:
-    register_generator("pillars", lambda source, difficulty: World(name="empty"))
-    assert not generate_world("pillars", 0).cylinders
-    register_generator("pillars", pillars)
-    assert generate_world("pillars", 0).cylinders
 
 
 def test_rooms_beyond_the_bounds_of_observations_are_rejected() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from mpfa_envs import GoalRelabeling, NavigationTorchEnv, RewardTerms, TaskConfig
 
@@ -164,14 +163,3 @@ def test_a_reward_for_progress_is_rejected(progress):
 def test_a_reward_of_one_s_own_is_rejected():
     with pytest.raises(ValueError, match="reward must be None or navigation_reward"):
         GoalRelabeling(TaskConfig(progress="none", reward=lambda outcome: RewardTerms(goal=1.0)))
-
-
-@pytest.mark.parametrize("num_envs", [None, 3])
-def test_what_goals_need_is_in_the_specs(num_envs):
-    env = make_env(world="A", num_envs=num_envs)
-    check_env_specs(env)
-    moments = env.reset()["hindsight"].reshape(env.env.num_envs, -1)
-    expected = env.env.motions
-    np.testing.assert_array_equal(moments[:, :2].numpy(), expected[:, :2])
-    np.testing.assert_array_equal(moments[:, 4:9].numpy(), expected)
-    assert moments[0, 2:4].tolist() == list(env.env.worlds[0].size)

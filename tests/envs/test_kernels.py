@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, TaskConfig, World
+from mpfa_envs import ROBOTS, WORLDS, Lidar, TaskConfig, World
 from mpfa_envs.compiled import njit
 from mpfa_envs.robots.drives import KinematicDrives
 from mpfa_envs.worlds.batch import WorldBatch
@@ -57,24 +57,6 @@ def test_rays_meet_what_plain_geometry_says(
     np.testing.assert_allclose(cast_all(worlds, motions, lidar), expected, atol=1e-9)
     np.testing.assert_array_equal(
         lidar.cast(*motions[0, :3]), cast_all(worlds[:1], motions[:1], lidar)[0]
-    )
-
-
-@pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi, 0.7])
-@pytest.mark.parametrize(("sectors", "rays"), [(1, 1), (2, 1), (18, 3), (360, 2)])
-@pytest.mark.parametrize("view", [180.0, 330.0, 360.0])
-def test_any_number_of_rays_sees_boxes_all_around(
-    heading: float, sectors: int, rays: int, view: float
-) -> None:
-    ring = tuple(
-        Box(x - 0.3, y - 0.2, x + 0.3, y + 0.2)
-        for x, y in ((2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2))
-    )
-    world = World(name="ring", boxes=ring)
-    lidar = Lidar(world, sectors=sectors, rays_per_sector=rays, field_of_view=view)
-    motions = np.array([[0.01, 0.02, heading, 0.0, 0.0]])
-    np.testing.assert_allclose(
-        cast_all([world], motions, lidar)[0], scan(lidar, world, 0.01, 0.02, heading), atol=1e-9
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -25,9 +24,7 @@ from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
-from mpfa_envs.sensing.observation import observation_slices
 from mpfa_envs.worlds.occupancy import OccupancyGrid
-from tests.envs.paper import drive_to_end
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]
@@ -140,17 +137,6 @@ def test_a_door_ten_centimeters_wider_than_the_robot_is_open_wherever_cells_begi
     assert path[2] < 1.0
 
 
-def test_the_path_leads_straight_to_a_visible_goal() -> None:
-    world = World(name="empty")
-    memory = MapMemory(1, ROBOT, Lidar(world))
-    memory.begin(0, world)
-    # Not the middle of a cell.
-    path = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 0.93))
-    bearing = math.atan2(0.93, 1.0) - 0.5
-    assert path[:2] == pytest.approx([math.cos(bearing), math.sin(bearing)])
-    assert path[2] == pytest.approx(1.37, abs=0.1)
-
-
 def test_a_robot_without_a_scan_keeps_its_map_and_path() -> None:
     lidar, memory = Lidar(POCKET), MapMemory(2, ROBOT, Lidar(POCKET))
     motions, goals = np.zeros((2, 5)), np.full((2, 2), 3.0)
@@ -172,62 +158,6 @@ def test_an_episode_begins_with_an_empty_map() -> None:
     memory.begin(0, POCKET)
     assert not memory.arrays.levels[0].any()
     assert scan(memory, Lidar(POCKET), (0.0, 0.0, 0.0), (3.0, 0.0)) == before
-
-
-def test_nothing_of_the_room_is_known_before_it_was_seen() -> None:
-    lidar, empty = Lidar(POCKET), Lidar(World(name="empty"))
-    paths = []
-    for sensor in (lidar, empty):
-        memory = MapMemory(1, ROBOT, sensor)
-        memory.begin(0, POCKET)
-        # The pocket is behind the robot.
-        paths.append(scan(memory, sensor, (-2.0, 0.0, math.pi), (3.0, 0.0)))
-    assert paths[0] == paths[1]
-
-
-def follow(observation: np.ndarray, part: str) -> np.ndarray:
-    """Drive towards a direction that is sensed."""
-    across, up = observation[observation_slices(memory="map")[part]]
-    turn = np.clip(1.5 * math.atan2(up, across), -1.0, 1.0)
-    speed = 1.0 - abs(turn)
-    return np.clip(2 * np.array([speed - turn, speed + turn]) - 1, -1.0, 1.0)
-
-
-def test_the_path_leads_out_of_a_pocket() -> None:
-    env = NavigationEnv(world=POCKET, physics="kinematic", memory="map", max_steps=1000)
-    ends = {}
-    for part in ("way_direction", "goal_direction"):
-        *_, info = drive_to_end(env, partial(follow, part=part), goal=(3.0, 0.0))
-        ends[part] = info["success"]
-    assert ends == {"way_direction": True, "goal_direction": False}
-    env.close()
-
-
-def test_the_path_leads_round_a_wall_however_long_that_is() -> None:
-    world = World(name="long", size=(30.0, 6.0), boxes=(Box(-15.0, -0.1, 13.0, 0.1),))
-    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
-    memory.begin(0, world)
-    for x in range(-14, 14, 2):
-        for heading in (-1.6, 0.0, 1.6, 3.1):
-            path = scan(memory, lidar, (x, -1.0, heading), (-14.0, 1.0))
-    path = scan(memory, lidar, (-14.0, -1.0, 0.0), (-14.0, 1.0))
-    assert 55.0 < path[2] < 70.0
-    sketch = memory.sketch(0, -14.0, -1.0)
-    places = np.rint((np.array(sketch.path) - memory.arrays.origins[0]) / RESOLUTION).astype(int)
-    assert not sketch.blocked[places[:, 0], places[:, 1]].any()
-
-
-def test_beside_the_end_of_a_wall_the_path_never_leads_through_the_wall() -> None:
-    wall = World(name="wall", size=(8.0, 8.0), boxes=(Box(-0.1, 0.0, 0.1, 3.0),))
-    lidar = Lidar(wall, sectors=36, rays_per_sector=3, field_of_view=360.0)
-    for clearance in (0.01, 0.02, 0.03, 0.05, 0.06):
-        pose = 0.1 + ROBOT.radius + clearance, 2.6, 0.5 * math.pi
-        memory = MapMemory(1, ROBOT, lidar)
-        memory.begin(0, wall)
-        scan(memory, lidar, pose, (-2.5, 1.5))
-        ahead, left, _ = scan(memory, lidar, pose, (-2.5, 1.5))
-        # The wall is to the left, its end ahead.
-        assert abs(math.atan2(left, ahead)) < math.radians(80.0)
 
 
 def test_the_map_extends_the_observation_and_changes_nothing_else() -> None:

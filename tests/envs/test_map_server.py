@@ -1,6 +1,5 @@
 """Maps of other tools, read as map_server and Nav2 read them."""
 
-import math
 import re
 import warnings
 
@@ -88,12 +87,6 @@ def test_what_map_server_accepts_is_read(old, new, told, tmp_path):
         assert re.search(told, str(caught[0].message))
 
 
-def test_a_map_in_utf_16_is_read(tmp_path):
-    path = write_map(tmp_path, np.full((3, 4), 254, dtype=np.uint8))
-    path.write_bytes(path.read_text().encode("utf-16"))
-    assert load_world(path).size == pytest.approx((0.2, 0.15))
-
-
 @pytest.mark.parametrize(
     ("yaw", "occupied", "origin"),
     [
@@ -109,24 +102,3 @@ def test_an_origin_turned_by_quarters_turns_the_cells_about_it(yaw, occupied, or
     world = load_world(write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {yaw}]"))
     assert np.argwhere(world.occupancy.occupied).tolist() == [occupied]
     assert world.occupancy.origin == pytest.approx(origin)
-
-
-def test_a_turned_map_is_cut_as_one_that_is_not(tmp_path):
-    shades = np.full((60, 50), 205, dtype=np.uint8)
-    shades[10:30, 15:40] = 254
-    shades[12, 20] = 0
-    straight = load_world(write_map(tmp_path, shades)).occupancy
-    turned = load_world(write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {math.pi / 2}]")).occupancy
-    np.testing.assert_array_equal(turned.occupied, np.rot90(straight.occupied))
-    # Turned about (-1, 2), the middle (-1 + a, 2 + b) is at (-1 - b, 2 + a).
-    along, up = straight.center[0] + 1.0, straight.center[1] - 2.0
-    assert turned.center == pytest.approx((-1.0 - up, 2.0 + along))
-
-
-def test_a_map_that_is_mostly_cut_off_may_be_large(tmp_path):
-    shades = np.full((5000, 4000), 205, dtype=np.uint8)
-    shades[2000:2010, 2000:2010] = 254
-    # As a whole it has 20 million cells and is 2,500 m wide.
-    world = load_world(write_map(tmp_path, shades, resolution=0.5))
-    assert world.occupancy.occupied.shape == (12, 12)
-    assert world.occupancy.origin == pytest.approx((-1.0 + 1999 * 0.5, 2.0 + 2989 * 0.5))

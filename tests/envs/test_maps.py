@@ -19,7 +19,7 @@ from mpfa_envs import (
     load_world,
     save_world,
 )
-from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from tests.envs.map_files import write_map
 from tests.envs.shapes import GRID, SCATTERED, cells
@@ -61,15 +61,6 @@ def test_rays_meet_cells_where_they_meet_boxes_in_their_place(scattered):
     lidars = [Lidar(world, sectors=18) for world in scattered]
     for x, y, heading in places(scattered[0], 200):
         np.testing.assert_allclose(*(lidar.cast(x, y, heading) for lidar in lidars), atol=1e-9)
-
-
-def test_rays_along_the_edges_of_cells_meet_the_cell_ahead():
-    occupied = np.zeros((20, 20), dtype=bool)
-    occupied[15, 10] = occupied[10, 15] = True
-    lidar = Lidar(World(name="two", occupancy=OccupancyGrid(occupied, 0.5)), sectors=3)
-    ranges = lidar.cast(0.25, 0.25, 0.0)
-    assert ranges[len(ranges) // 2] == pytest.approx(2.25)  # Straight on, to the cell's near side.
-    np.testing.assert_allclose(lidar.cast(0.25, 0.25, math.pi / 2).min(), 2.25)
 
 
 def test_robots_share_a_map_and_unused_maps_go(scattered):
@@ -262,19 +253,6 @@ def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_p
     with pytest.raises(ValueError, match="resolution must leave"):
         WORLDS["A"].to_map(tmp_path / "map.yaml", resolution=0.001)
     assert not list(tmp_path.iterdir())
-
-
-def test_paths_in_a_map_equal_those_among_its_boxes(scattered):
-    grids = [FreeGrid(world, distance=0.18) for world in scattered]
-    rng = np.random.default_rng(2)
-    free = grids[0].cells
-    for _ in range(20):
-        start, goal = (grids[0].center(*free[rng.integers(len(free))]) for _ in range(2))
-        lengths = [grid.length(start, goal) for grid in grids]
-        assert lengths[0] == pytest.approx(lengths[1], abs=1e-9)
-    field = DistanceField(grids[0], goal, 2.0)
-    assert field.lengths[np.isfinite(field.lengths)].max() <= 2.0
-    assert field.at(*goal) < 0.1
 
 
 def test_a_robot_drives_in_a_map_as_among_boxes(scattered, physics):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -18,13 +17,10 @@ from mpfa_envs import (
     RobotModel,
     RobotNoise,
     TaskConfig,
-    World,
     load_robot,
     load_world,
 )
-from mpfa_envs.checks import check_number
 from mpfa_envs.robots.robot_file import RobotFileError
-from mpfa_envs.tasks.sampling import evaluation_pairs
 from tests.envs.map_files import write_map
 
 
@@ -123,34 +119,3 @@ def test_cells_of_a_map_that_nobody_means_are_warned_of(
 ) -> None:
     with pytest.warns(UserWarning, match=rf"map.yaml:2: .* of {size} m; did you mean 0\.?[01]"):
         load_world(write_map(tmp_path, HALL, resolution=resolution))
-
-
-@pytest.mark.parametrize(("resolution", "rows"), [(0.01, 240), (0.25, 240), (0.5, 40)])
-def test_cells_that_may_be_meant_are_not_warned_of(
-    tmp_path: Path, resolution: float, rows: int
-) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        load_world(write_map(tmp_path, HALL[:rows, :90], resolution=resolution))
-
-
-@pytest.mark.parametrize("size", [(1.8, 1.2), (30.0, 1.2)])
-def test_a_room_without_a_task_is_described(size: tuple[float, float]) -> None:
-    text = rf"in a room of {size[0]:g} x 1.2 m, of whose cells \d+\.\d% are 0.21 m from"
-    with pytest.raises(ValueError, match=text):
-        evaluation_pairs(World(name="narrow", size=size), 1, 0, min_goal_distance=40.0)
-
-
-@pytest.mark.parametrize(("name", "ends"), [("radius", (0.01, 5.0)), ("field_of_view", (7.0, 360))])
-def test_a_number_at_an_end_of_what_can_be_meant_is_taken(
-    name: str, ends: tuple[float, float]
-) -> None:
-    for end in ends:
-        assert check_number(name, end) == check_number(name, -end) * -1 == end
-        with pytest.raises(ValueError, match="in size"):
-            check_number(name, 0.99 * end if end == ends[0] else 1.01 * end)
-
-
-def test_a_number_of_a_nested_name_is_judged_by_its_last_part() -> None:
-    with pytest.raises(ValueError, match=r"lidar\.field_of_view must .* did you mean 240.1"):
-        check_number("lidar.field_of_view", 4.19)

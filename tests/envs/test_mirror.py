@@ -65,19 +65,6 @@ def test_front_and_rear_are_those_of_a_robot_put_down_the_other_way_round(robot:
     other.close()
 
 
-@pytest.mark.parametrize("sectors", [6, 36])
-def test_each_mirror_undoes_itself_and_they_commute(sectors: int) -> None:
-    sides = [
-        Mirror(sectors=sectors, memory="map", history=1, front_rear=each) for each in (False, True)
-    ]
-    seen, done = torch.rand(5, 2 * sectors + 9), torch.rand(5, 2)
-    for what, values in (("observation", seen), ("action", done)):
-        left_right, front_rear = (getattr(side, what) for side in sides)
-        for side in (left_right, front_rear):
-            assert side(side(values)).equal(values) and not side(values).equal(values)
-        assert left_right(front_rear(values)).equal(front_rear(left_right(values)))
-
-
 @pytest.mark.parametrize(
     ("task", "mirrors"),
     [
@@ -176,15 +163,6 @@ def test_half_of_the_transitions_are_mirrored_each_as_a_whole() -> None:
     # 400 samples of one half: five standard deviations are 50.
     assert 150 < in_the_mirror.sum() < 250
     assert batch["next", "reward"].equal(stored["next", "reward"])
-
-
-def test_stored_data_stays_and_samples_follow_the_seed() -> None:
-    rollout, batch = sample(0.0)
-    assert batch["observation"].equal(rollout["observation"][batch["index"]])
-    torch.manual_seed(1)
-    first = sample(0.5, seed=3)[1]
-    torch.manual_seed(1)
-    assert first["observation"].equal(sample(0.5, seed=3)[1]["observation"])
 
 
 def test_the_action_without_noise_is_mirrored_with_the_action() -> None:

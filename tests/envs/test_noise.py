@@ -39,14 +39,6 @@ def places(infos):
     return np.array([[info[name] for name in ("x", "y", "heading")] for info in infos])
 
 
-@pytest.mark.parametrize("noise", [None, RobotNoise(), {}])
-def test_without_noise_nothing_is_added(noise):
-    env = VectorNavigationEnv(2, noise=noise, **KINEMATIC)
-    assert env.config.noise == RobotNoise()
-    assert env._batch.noise is None
-    assert not env.lidar.is_noisy
-
-
 def test_late_actions_are_those_that_were_told_before():
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, (30, 2))
     _, prompt = drive(None, actions, action_repeat=1)
@@ -145,17 +137,6 @@ def test_drift_scales_paths_and_turns_alike_throughout_an_episode():
     np.testing.assert_allclose(np.hypot(*(motion.odometry[:, :2]).T), 0.1 * paths, rtol=0.02)
 
 
-def test_odometry_without_errors_is_where_the_robot_is():
-    motion = NoisyMotion(RobotNoise(drift=1e-300), 1, wheel_base=0.23, time_step=0.1)
-    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))
-    _, infos = drive(None, actions, task=Task((0.0, 0.0, 3.0), (4.0, 4.0)), action_repeat=1)
-    rows = places(infos)
-    motion.begin(0, rows[0], np.random.default_rng(0))
-    for row in rows[1:]:
-        motion.measure(np.concatenate((row, [0.0, 0.0]))[None], np.ones(1, dtype=bool))
-        np.testing.assert_allclose(motion.odometry[0, :3], row, atol=1e-12)
-
-
 def test_the_task_is_judged_by_where_the_robot_is():
     noise = RobotNoise(drift=0.3)
     seen, infos = drive(noise, np.ones((80, 2)), seed=2)
@@ -175,13 +156,6 @@ def test_rays_drop_out_as_often_as_is_said():
     np.testing.assert_array_equal(scans[~lost], np.broadcast_to(clear, scans.shape)[~lost])
     with pytest.raises(ValueError, match="rng must be a Generator"):
         lidar.measure(0.0, 0.0, 0.0)
-
-
-def test_a_seed_has_its_noise():
-    actions = np.full((20, 2), 0.5)
-    one, again, other = (drive(ALL, actions, seed=seed)[0] for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, again)
-    assert not np.array_equal(one, other)
 
 
 def test_twice_the_noise_is_twice_each():

@@ -6,7 +6,6 @@ import itertools
 import math
 import subprocess
 import sys
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,7 +35,6 @@ from mpfa_envs.planners import (
 )
 from mpfa_envs.planners.ant_colony import moves_of_cells
 from mpfa_envs.robots.model import ROBOTS
-from mpfa_envs.sensing.observation import Memory
 
 # A wall from side to side: nothing gets through.
 DIVIDED = World(name="divided", size=(4.0, 4.0), boxes=(Box(-0.1, -2.0, 0.1, 2.0),))
@@ -66,20 +64,6 @@ def test_a_path_is_as_long_as_that_of_the_grid(world: str) -> None:
         assert path_length(grid, path) == pytest.approx(grid.length(start, goal), abs=1e-9)
         for x, y in path[1:-1]:
             assert room.clearance(x, y) >= 0.25 - 1e-6
-
-
-def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
-    grid = FreeGrid(WORLDS["D"], distance=0.25)
-    start, goal = (-4.0, -4.0), (4.0, 4.0)
-    neighbors, lengths = moves_of_cells(grid)
-    np.testing.assert_array_equal(neighbors < len(grid.cells), np.isfinite(lengths))
-    number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
-    for search in (shortest_path, AntColony(ants=4, iterations=2)):
-        path = search(grid, start, goal)
-        assert path is not None
-        cells = [number[grid.index(*place)] for place in path[1:-1]]
-        for cell, following in pairwise(cells):
-            assert following in neighbors[cell]
 
 
 @pytest.mark.slow
@@ -127,20 +111,6 @@ def test_ants_find_a_path_within_a_tenth_of_the_shortest(world: str) -> None:
         assert path_length(grid, path) <= 1.1 * grid.length(start, goal) + grid.resolution
 
 
-def test_ants_learn_from_one_another() -> None:
-    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
-    ends = (-4.0, -4.0), (4.0, 4.0)
-    lengths = {}
-    # As many walks, with and without pheromone that remembers.
-    for evaporation in (0.0, 0.2):
-        paths = [
-            AntColony(ants=6, iterations=12, evaporation=evaporation, seed=seed)(grid, *ends)
-            for seed in range(4)
-        ]
-        lengths[evaporation] = np.mean([path_length(grid, path or []) for path in paths])
-    assert lengths[0.2] < lengths[0.0]
-
-
 def test_ants_give_the_best_path_of_all_iterations_without_loops() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
     neighbors, _ = moves_of_cells(grid)
@@ -171,15 +141,6 @@ def test_ants_mark_the_iterations_path_and_the_best_so_far_in_turn() -> None:
     best = np.minimum.accumulate(lengths)
     np.testing.assert_array_equal(lengths[1::2], best[1::2])
     assert (np.array(lengths[::2]) > best[::2]).any()
-
-
-def test_a_seed_of_the_ants_decides_their_path() -> None:
-    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
-    first, again, other = (
-        AntColony(ants=4, iterations=2, seed=seed)(grid, (-4.0, -4.0), (4.0, 4.0))
-        for seed in (0, 0, 1)
-    )
-    assert first == again != other
 
 
 def test_ants_stop_after_the_iteration_in_which_time_is_up() -> None:
@@ -250,36 +211,6 @@ def test_the_followers_reach_the_goals_of_map_d(name: str) -> None:
     assert all(result.plan_s > 0.0 and result.decision_s > 0.0 for result in results)
 
 
-@pytest.mark.parametrize("robot", ["kobuki", "turtlebot4", "burger"])
-@pytest.mark.parametrize("name", ["dijkstra", "dwa"])
-def test_robots_that_can_stop_reach_the_goals_of_map_d(name: str, robot: str) -> None:
-    memory: Memory = "map" if name == "dwa" else "none"
-    planner = make_planner(name, robot=robot, memory=memory)
-    results = evaluate(planner, "D", episodes=4, seed=3, max_steps=1500)
-    assert all(result.success for result in results)
-
-
-def seen_by_kobuki(ranges: dict[int, float], *, way: float = 0.0) -> np.ndarray:
-    """What a standing Kobuki sees: ranges by sector [m], the goal 3 m away at an angle."""
-    lidar = np.full(36, 0.25 / 10.0)
-    for sector, distance in ranges.items():
-        lidar[sector] = min(0.25 / distance, 1.0)
-    return np.array([*lidar, math.cos(way), math.sin(way), 0.1, 0.3, 0.0, 0.0], np.float32)
-
-
-def test_the_dynamic_window_turns_on_the_spot_to_a_goal_behind() -> None:
-    around = dict.fromkeys(range(36), 0.27)
-    left, right = make_planner("dwa", robot="kobuki")(seen_by_kobuki(around, way=2.5))
-    assert right > 0.0 > left and left + right == pytest.approx(0.0, abs=1e-6)
-
-
-def test_the_dynamic_window_does_not_drive_at_a_wall() -> None:
-    wall = {sector: 0.28 / math.cos(math.radians(175 - 10 * sector)) for sector in range(12, 24)}
-    left, right = make_planner("dwa", robot="kobuki")(seen_by_kobuki(wall))
-    # It does not stand and face the goal behind the wall either.
-    assert left != right and left + right <= 0.5
-
-
 def test_pursuit_turns_on_the_spot_to_a_point_beside_the_robot() -> None:
     grid = FreeGrid(WORLDS["A"], distance=0.25)
     for side in (1.0, -1.0):
@@ -293,16 +224,6 @@ def test_the_follower_reaches_goals_on_wheels() -> None:
     assert sum(result.success for result in results) >= 3
 
 
-def test_paths_do_not_depend_on_the_number_of_robots() -> None:
-    tasks = world_tasks("D", episodes=4) + world_tasks("B", episodes=3)
-    arguments = {"physics": "kinematic", "max_steps": 150}
-    alone, together = (
-        run_tasks(make_planner("dijkstra"), tasks, envs_at_once=count, **arguments)
-        for count in (1, 5)
-    )
-    assert alone == together
-
-
 def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
     # A gap of 0.46 m: room for the robot, 0.36 m across, and not for its clearance.
     gap = World(
@@ -314,15 +235,6 @@ def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
     # Where there is no path at all it tries its luck.
     straight, _ = MapPlanner(shortest_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
     assert straight == [(-1.0, 0.0), (1.0, 0.0)]
-
-
-def test_a_planner_plans_in_the_world_that_it_is_in() -> None:
-    planner = MapPlanner(shortest_path)
-    ends = (-4.0, -4.0), (4.0, 4.0)
-    planner.plan(WORLDS["A"], *ends)
-    path, grid = planner.plan(WORLDS["D"], *ends)
-    assert grid.world is WORLDS["D"]
-    assert path == MapPlanner(shortest_path).plan(WORLDS["D"], *ends)[0]
 
 
 def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,18 +273,3 @@ def test_a_driver_sees_each_episodes_world_and_task() -> None:
     tasks = world_tasks("A", episodes=3) + world_tasks("B", episodes=2)
     run_tasks(Told(), tasks, envs_at_once=2, physics="kinematic", max_steps=10)
     assert sorted(begun) == sorted((each.world.name, each.task.goal) for each in tasks)
-
-
-def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
-    seen: list[object] = []
-
-    def policy(observation: np.ndarray) -> np.ndarray:
-        seen.append(observation)
-        return np.zeros((*observation.shape[:-1], 2))
-
-    observations = np.zeros((3, 24), np.float32)
-    driver = as_driver(policy)
-    driver.begin(None, 0)
-    actions = driver.drive(None, np.arange(3), observations)
-    assert actions.shape == (3, 2) and seen[0] is observations
-    assert as_driver(driver) is driver

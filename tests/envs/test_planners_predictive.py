@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -238,15 +237,6 @@ def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
     again, _ = env.reset(seed=0, options=options)
     planner.begin(env, 0)
     np.testing.assert_array_equal(planner.drive(env, robots, again), first)
-
-
-def test_paths_do_not_depend_on_the_number_of_robots() -> None:
-    tasks = world_tasks("D", episodes=5)
-    drive = partial(run_tasks, tasks=tasks, **PredictiveControl(robot="kobuki").env_arguments)
-    alone, together = (
-        drive(make_planner("mpc", robot="kobuki"), envs_at_once=count) for count in (1, 5)
-    )
-    assert [each.time_s for each in alone] == [each.time_s for each in together]
 
 
 def test_predictive_control_needs_the_map_of_its_robot() -> None:

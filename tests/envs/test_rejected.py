@@ -71,14 +71,8 @@ TASK: Rows = [
     ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
     ({"progress": "path"}, "progress must be one of .*got 'path'"),
     ({"max_steps": 0}, "max_steps must be a positive integer, got 0"),
-    ({"max_steps": True}, "max_steps must be a positive integer, got True"),
     ({"action_repeat": 0}, "action_repeat must be a positive integer, got 0"),
-    ({"action_repeat": -1}, "action_repeat must be a positive integer, got -1"),
-    ({"action_repeat": 1.5}, "action_repeat must be a positive integer, got 1.5"),
-    ({"action_repeat": True}, "action_repeat must be a positive integer, got True"),
     ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
-    ({"time_step": "1"}, "time_step must be a finite number, got '1'"),
-    ({"time_step": None}, "time_step must be a finite number, got None"),
     ({"time_step": 0.6}, "time_step must be at most 0.5 s, .*collision_distance = 0.25 .*got 0.6"),
     (
         {"robot": replace(ROBOTS["burger"], min_wheel_speed=-2.0), "time_step": 0.2},
@@ -88,17 +82,12 @@ TASK: Rows = [
     ({"min_goal_distance": 0.3}, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
     ({"closeness_distance": 0.0}, "closeness_distance must be positive, got 0.0"),
     ({"detour_chance": 1.1}, r"detour_chance must be in \[0, 1\], got 1.1"),
-    ({"detour_chance": math.nan}, "detour_chance must be a finite number, got nan"),
     ({"progress_scale": math.inf}, "progress_scale must be a finite number, got inf"),
     ({"clearance": -0.1}, "clearance must not be negative, got -0.1"),
-    ({"clearance": True}, "clearance must be a finite number, got True"),
-    ({"clearance": [1]}, r"clearance must be a finite number, got \[1\]"),
     ({"contact": "touch"}, "contact must be .*got 'touch'"),
     ({"reward": 3}, "reward must be callable or None, got 3"),
     ({"memory": "lstm"}, r"memory must be one of \('none', 'map'\), got 'lstm'"),
     ({"history": -1}, "history must be an integer of at least 0, got -1"),
-    ({"history": 1.5}, "history must be an integer of at least 0, got 1.5"),
-    ({"history": "two"}, "history must be an integer of at least 0, got 'two'"),
     ({"lidar": {"sectors": 0}}, "sectors must be a positive integer, got 0"),
     ({"lidar": {"reduction": "mean"}}, "reduction must be one of .*got 'mean'"),
     ({"lidar": {"max_range": -1.0}}, r"max_range must be positive, got -1\.0"),
@@ -120,7 +109,6 @@ ONE: Rows = [
 ]
 MANY: Rows = [
     ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
-    ({"num_envs": 2.5}, "num_envs must be a positive integer, got 2.5"),
     ({"world": []}, "world must hold at least one world, got an empty sequence"),
     ({"world": ["A", "tets"]}, "world must be .*got 'tets' .did you mean 'test'"),
     ({"world": "barz"}, "world must be .*got 'barz' .did you mean 'bars'"),
@@ -145,13 +133,10 @@ TORCHRL: Rows = [
     ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
     ({"parallel": True, "num_envs": 2, "world": ["A", "B"]}, "world must be one, .*, got"),
     ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
-    ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),
 ]
 ROBOT: Rows = [
     ({"radius": 0.0}, "radius must be positive, got 0.0"),
     ({"mass": math.inf}, "mass must be a finite number, got inf"),
-    ({"mass": "heavy"}, "mass must be a finite number, got 'heavy'"),
-    ({"mass": True}, "mass must be a finite number, got True"),
     ({"name": ""}, "name must be a non-empty string, got ''"),
     ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
     (
@@ -168,9 +153,7 @@ NOISE: Rows = [
 ]
 LIDAR: Rows = [
     ({"field_of_view": 0.0}, "field_of_view must be positive, got 0.0"),
-    ({"field_of_view": -90.0}, "field_of_view must be positive, got -90.0"),
     ({"field_of_view": 361.0}, "field_of_view must be at most 360 deg in size, got 361"),
-    ({"field_of_view": math.nan}, "field_of_view must be a finite number, got nan"),
 ]
 PAIRS: Rows = [
     ({"pairs": [(1.0, 1.0)]}, r"pairs must be two or more pairs of numbers, got \[\(1.0, 1.0\)\]"),
@@ -188,8 +171,6 @@ MIRROR: Rows = [
 ]
 CHANCE: Rows = [
     ({"chance": -0.1}, r"chance must be in \[0, 1\], got -0.1"),
-    ({"chance": 1.5}, r"chance must be in \[0, 1\], got 1.5"),
-    ({"chance": math.nan}, "chance must be a finite number, got nan"),
 ]
 BINS: Rows = [
     ({"groups": 0}, "groups must be a positive integer, got 0"),
@@ -211,7 +192,6 @@ PILOT: Rows = [
 ]
 CONTROLLER: Rows = [
     ({"stop_distance": -0.1}, "stop_distance must not be negative, got -0.1"),
-    ({"stop_distance": math.nan}, "stop_distance must be a finite number, got nan"),
     ({"scan_timeout": 0.0}, "scan_timeout must be positive, got 0.0"),
     ({"odometry_timeout": math.inf}, "odometry_timeout must be a finite number, got inf"),
     ({"check_period": 0.0}, "check_period must be positive, got 0.0"),
@@ -354,7 +334,6 @@ ROOMS_RESET: Rows = [
 MANY_RESET: Rows = [
     ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
     ({"seed": [1]}, "seed must have 2 entries, got 1"),
-    ({"seed": [1, -1]}, "seed must be an integer of at least 0, got -1"),
     ({"seed": np.array([1, 2])}, r"seed must be an integer of at least 0, got array\(\[1, 2\]\)"),
     *(
         ({"seed": 1, "options": options}, message)

@@ -83,15 +83,11 @@ SHAPES: Rows = [
     (lambda: World(name="x", boxes=(Box(4, 0, 6, 1),)), "boxes must lie in the room"),
     (lambda: World(name="x", cylinders=(Cylinder(5, 0, 1),)), "cylinders must lie in the room"),
     (lambda: World(name="x", goal_regions=(Box(4, 0, 6, 1),)), "goal_regions must lie in"),
-    (lambda: Box("1", 0, 2, 2), "box must have finite edges, got .*'1'"),
-    (lambda: Box(0, 0, True, 2), "box must have finite edges, got .*True"),
     (lambda: Cylinder(None, 0, 1), "cylinder must have finite numbers, got .*None"),
     (lambda: Polygon(3), "polygon must have a list of vertices, got 3"),
-    (lambda: Polygon(("ab", "cd", "ef")), "polygon must have two finite numbers .*'ab'"),
     (lambda: Polygon(((0, 0), (1, 1))), "3 to 100 vertices, got 2"),
     (lambda: Polygon(around(101)), "3 to 100 vertices, got 101"),
     (lambda: Polygon(((0, 0), (1, 1), (1, math.inf))), "two finite numbers a vertex"),
-    (lambda: Polygon(((0, 0), (1, 1), (1,))), "two finite numbers a vertex"),
     (lambda: Polygon(((0, 0), (1, 1), (2, 2))), "must have an area"),
     (lambda: Polygon(((0, 0), (1, 1), (1, 0), (0, 1))), "does not cross"),
     (
@@ -99,7 +95,6 @@ SHAPES: Rows = [
         "does not cross or touch itself",
     ),
     (lambda: Polygon(((0, 0), (2, 0), (2, 2), (1, 0), (0, 2))), "does not cross or touch"),
-    (lambda: Polygon(((0, 0), (2, 0), (2, 0), (0, 2))), "does not cross or touch itself"),
     (lambda: Polygon(((0, 0), (2, 0), (1, 0), (1, 2))), "does not cross or touch itself"),
     # A pentagram turns left at each of its points, twice around.
     (lambda: Polygon(around(5, 2.513)), "does not cross"),
@@ -109,10 +104,7 @@ SHAPES: Rows = [
     ),
     (lambda: World(name=None), "name must be text, got None"),
     (lambda: World(name="x", size=8), "size must be two positive lengths, got 8"),
-    (lambda: World(name="x", size=("1", "2")), "size must be two positive .*'1'"),
-    (lambda: World(name="x", size=()), r"size must be two positive lengths, got \(\)"),
     (lambda: World(name="x", boxes=Box(0, 0, 1, 1)), "boxes must be a tuple of Box, got Box"),
-    (lambda: World(name="x", boxes=((1, 1, 2, 2),)), "boxes must be a tuple of Box, got"),
     (lambda: World(name="x", cylinders=(Box(0, 0, 1, 1),)), "cylinders must be a tuple of Cyl"),
     (lambda: World(name="x", walkers=Walker()), "walkers must be a tuple of Walker, got"),
     (lambda: World(name="x", occupancy=3), "occupancy must be an OccupancyGrid, got 3"),
@@ -165,7 +157,6 @@ MADE: Rows = [
         r"generator must be one of \['rooms',.*got 'bers' \(did you mean 'bars'\?\)",
     ),
     (partial(generate_world, "bars", -1), "seed must be an integer of at least 0, got -1"),
-    (partial(generate_world, "bars", True), "seed must be an integer of at least 0, got True"),
     (partial(generate_world, "bars", 3 * 10**9), "seed must be at most 2999999999, got 300"),
     *(
         (partial(generate_world, "bars", 1, difficulty=each), "difficulty must be")
@@ -204,7 +195,6 @@ DRIVEN: Rows = [
         "envs_at_once must be a positive integer, got 1.5",
     ),
     (partial(world_tasks, "maze:test"), "NAME:test .*got 'maze:test' .did you mean 'mazes'"),
-    (partial(evaluated, world="tets"), "world must be .*did you mean 'test'"),
     (partial(evaluated, world=["A", "tets"]), "world must be .*did you mean 'test'"),
     (partial(evaluated, physics="magic"), "physics must be one of .*got 'magic'"),
     # A policy of one observation is asked for two.
@@ -258,7 +248,6 @@ PICTURES: Rows = [
     (partial(FIELD, values=len, heading="north"), "heading must be"),
     (partial(render_samples, "A", np.zeros((0, 2)), [], []), "positions must have shape"),
     (partial(render_samples, "A", PLACES, [1.0], [1, 1]), "priorities must have shape"),
-    (partial(render_samples, "A", PLACES, [1.0, np.nan], [1, 1]), "priorities must be finite"),
     (partial(render_samples, "A", PLACES, [1.0, 1.0], [2]), "sampled must be numbers below 2"),
     (partial(render_samples, "A", PLACES, [1.0, 1.0], [0.5]), "sampled must be 2 counts or"),
     (

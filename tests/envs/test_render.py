@@ -18,7 +18,6 @@ from mpfa_envs.render import (
     render_trajectories,
     shown_episodes,
     tiled,
-    viridis,
     write_animation,
 )
 from mpfa_envs.robots.model import ROBOTS
@@ -76,26 +75,6 @@ def test_walkers_are_shown_beside_the_paths() -> None:
     assert pixel(walked, -1.0, 2.0) == pixel(empty, -1.0, 2.0)
 
 
-def test_a_long_room_gives_a_long_picture() -> None:
-    world = World(name="hall", size=(9.6, 4.6))
-    assert render_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
-
-
-def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
-    world = World(name="narrow", size=(2.6, 20.0))
-    ends = list(OUTCOMES)
-    picture = render_trajectories(world, [[]] * 4, [(0, 0)] * 4, ends, title="narrow", size=360)
-    footer = picture[360:].astype(int)
-    for color in OUTCOMES.values():
-        assert (abs(footer - color[:3]).sum(-1) < 10).sum() > 50
-    # Its last letter is whole: some white is beside it.
-    assert (footer[:, -10:] == 255).all()
-    dark = np.flatnonzero((picture[180] < 100).all(-1))
-    left, right = dark[0], picture.shape[1] - 1 - dark[-1]
-    assert abs(left - right) <= 1
-    assert left > 100
-
-
 def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:
     dented = Polygon(((0.0, 0.0), (3.0, 0.0), (3.0, 3.0), (1.5, 1.0)))
     world = World(
@@ -109,16 +88,6 @@ def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:
         assert pixel(picture, x, y) == OBSTACLE[:3]
     for x, y in ((0.4, 0.7), (2.3, 2.5), (-1.5, 1.5)):
         assert pixel(picture, x, y) == FLOOR[:3]
-
-
-def test_a_goal_is_surrounded_by_the_disc_that_reaches_it() -> None:
-    near, far = (
-        render_trajectories("A", [[(-4, 0), (2, 0)]], [(2.5, 0.3)], ["success"], goal_radius=radius)
-        for radius in (0.3, 1.0)
-    )
-    for picture, inside, outside in ((near, 0.2, 0.4), (far, 0.9, 1.1)):
-        assert pixel(picture, 2.5, 0.3 + inside) not in (FLOOR[:3], GOAL[:3])
-        assert pixel(picture, 2.5, 0.3 + outside) == FLOOR[:3]
 
 
 def test_a_failure_ends_in_a_cross_or_hollow_square() -> None:
@@ -187,23 +156,6 @@ def test_pictures_are_put_row_by_row_with_white_between_them() -> None:
     assert whole[5, 22, 0] == whole[12, 5, 0] == whole[20, 30, 0] == 255
 
 
-def test_a_small_goal_keeps_its_color_in_an_animation(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    frames = []
-    for step in range(3):
-        frame = rng.integers(0, 256, (120, 120, 1), dtype=np.uint8).repeat(3, axis=2)
-        frame[10:14, 10 + step : 14 + step] = GOAL[:3]
-        frames.append(frame)
-    write_animation(frames, tmp_path / "a.gif", frame_time=0.2, speed=2.0)
-    with Image.open(tmp_path / "a.gif") as animation:
-        assert animation.n_frames == 3
-        assert animation.info["duration"] == 100
-        for step in range(3):
-            animation.seek(step)
-            shown = np.asarray(animation.convert("RGB"))
-            assert tuple(shown[12, 12 + step]) == GOAL[:3]
-
-
 def test_an_animation_is_thinned_and_keeps_its_last_frame(tmp_path: Path) -> None:
     ramp = np.arange(40, dtype=np.uint8)[None, :, None].repeat(40, axis=0).repeat(3, axis=2) * 6
     frames = [np.roll(ramp, 3 * n, axis=1) for n in range(50)]
@@ -227,9 +179,3 @@ def test_a_second_robot_has_another_color() -> None:
     )
     assert pixel(picture, 2.0, 0.15) == RIVAL[:3]
     np.testing.assert_allclose(pixel(picture, 2.6, 0.02), RIVAL[:3], atol=60)
-
-
-def test_values_get_lighter_as_they_rise() -> None:
-    lightness = viridis(np.linspace(0, 1, 50)) @ np.array([0.299, 0.587, 0.114])
-    assert (np.diff(lightness) > 0).all()
-    assert viridis([[-1.0, 2.0]]).shape == (1, 2, 3)

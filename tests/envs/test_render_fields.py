@@ -37,13 +37,6 @@ def test_the_observations_of_a_room_are_first_observations_of_episodes() -> None
     assert env.world.clearances(poses[:, :2]).min() > env.config.robot.radius
 
 
-def test_robots_that_face_the_goal_see_it_ahead() -> None:
-    _, observations = observe_room("A", goal=GOAL, heading="goal", spacing=2.0)
-    np.testing.assert_allclose(
-        observations[:, OBSERVATION["goal_direction"]], [[1.0, 0.0]] * len(observations), atol=1e-6
-    )
-
-
 def test_a_cell_has_the_color_of_its_value() -> None:
     def nearness(observations: np.ndarray) -> np.ndarray:
         return -observations[:, OBSERVATION["goal_distance"]].ravel()
@@ -102,20 +95,6 @@ def test_samples_are_bright_where_transitions_priorities_and_samples_are_many() 
     assert sums[1][1] > sums[1][0]
     assert sums[2][1] > sums[2][0]
     assert pixel(panels[0], 0.3, 3.3) == (250, 249, 246)
-
-
-def test_a_cell_of_fewer_than_three_transitions_stays_empty() -> None:
-    counts = {(-3.5, 3.5): 9, (0.5, 3.5): 3, (3.5, 3.5): 2}
-    places = np.repeat(np.array(list(counts)), list(counts.values()), axis=0)
-    ones = np.ones(len(places))
-    pictures = render_samples("A", places, ones, ones, spacing=1.0, size=480)
-    floor = (250, 249, 246)
-    shown = [pixel(pictures[:, :480], x, y) != floor for x, y in counts]
-    assert shown == [True, True, False]
-    # A cell ends where the next one begins.
-    assert [pixel(pictures[:, :480], x, 3.5) == floor for x in (-0.2, 0.2, 0.8, 1.2)] == [
-        *(True, False, False, True)
-    ]
 
 
 def test_rates_are_in_units_of_uniform_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,19 +163,3 @@ def test_a_long_film_has_fewer_pictures_and_its_end() -> None:
     for number, frame in enumerate(fewer.frames[:-1]):
         np.testing.assert_array_equal(frame, every.frames[4 * number])
     np.testing.assert_array_equal(fewer.frames[-1], every.frames[-1])
-
-
-@pytest.mark.parametrize(("side", "cells"), [(14.0, 70 * 70), (100.0, 71 * 71)])
-def test_a_picture_of_values_has_cells_by_its_pixels_in_large_rooms(
-    side: float, cells: int
-) -> None:
-    seen: list[int] = []
-
-    def values(observations: np.ndarray) -> np.ndarray:
-        seen.append(len(observations))
-        return np.zeros(len(observations))
-
-    world = World(name="hall", size=(side, side))
-    # At the goal and beside the walls there are no robots.
-    render_values(world, goal=(0.0, 0.0), values=values, size=640)
-    assert 0.9 * cells < seen[0] <= cells

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 import pytest
 from numpy.typing import NDArray
 
@@ -106,13 +105,6 @@ def test_a_robot_turns_and_brakes_no_faster_than_its_controller_allows(
     assert np.abs(aim).sum() < np.abs(before).sum()
 
 
-def test_a_robot_with_a_limited_turn_begins_to_turn_while_it_drives_off() -> None:
-    robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, turn_acceleration=4.0)
-    speeds = driven_from(robot, (0.0, 0.0), (-0.1, 0.7))
-    assert speeds[4, 1] == pytest.approx(5 * 4.0 * 0.02)
-    assert speeds[-1] == pytest.approx((0.3, math.pi))
-
-
 def test_a_controller_that_limits_the_turn_limits_the_forward_speed_apart_from_it() -> None:
     robot = replace(ROBOTS["kobuki"], wheel_acceleration=1.0, turn_acceleration=4.0)
     # Slower by 0.3 m/s, and a turn by 1 rad/s: for the left wheel far more than for the right one.
@@ -136,15 +128,6 @@ def test_a_body_that_does_not_reverse_turns_on_the_spot(
     assert (left + right) / 2 == pytest.approx(forward)
     assert (right - left) / 0.4 == pytest.approx(turn)
     assert -0.5 <= min(left, right) <= max(left, right) <= 0.9
-
-
-def test_the_casters_slide_and_the_wheels_hold() -> None:
-    simulation = BulletWorld(WORLDS["A"], time_step=0.1)
-    simulation.add_robot(ROBOTS["kobuki"])
-    body, client = simulation.bodies["robot"], simulation.client
-    friction = [pybullet.getDynamicsInfo(body, link, client)[1] for link in (-1, 0, 1)]
-    simulation.close()
-    assert friction == [0.0, 1.0, 1.0]
 
 
 def test_a_wall_stops_the_simulated_robot() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -105,30 +105,6 @@ def test_an_error_names_file_line_key_and_value(line: str, message: str, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("radus: 1\n", r":1: unknown key 'radus' in the file; did you mean 'radius'\?"),
-        ("radius: 1\nradius: 2\n", ":2: key 'radius' appears twice"),
-        (
-            "mass: 1\nradius: 1\n",
-            ":1: robot must have all its fields, got none for height, wheel_b",
-        ),
-        ("- 1\n", ":1: the file must be a mapping .*; docs/howto/robot.md has a file"),
-        ("{", ":1: is not YAML"),
-        (None, ": cannot be read"),
-    ],
-)
-def test_a_file_that_is_no_robot_is_rejected(
-    text: str | None, message: str, tmp_path: Path
-) -> None:
-    file = tmp_path / "bad.yaml"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(RobotFileError, match=rf"bad\.yaml{message}"):
-        TaskConfig(robot=file)
-
-
-@pytest.mark.parametrize(
     ("robot", "message"),
     [
         ("cart", r"robot must be .* \.yaml file or one of .*, got 'cart'"),
@@ -156,28 +132,6 @@ def test_each_part_takes_the_file() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("changes", "sectors", "each"),
-    [
-        ({}, 36, 3),
-        ({"lidar_rays": None}, 36, 3),
-        ({"lidar_rays": 72}, 36, 2),
-        ({"lidar_rays": 71}, 36, 1),
-        ({"lidar_rays": 9}, 9, 1),
-        ({"field_of_view": 90.0}, 9, 3),
-    ],
-)
-def test_the_lidar_of_the_task_is_that_of_the_robot(
-    changes: dict[str, Any], sectors: int, each: int
-) -> None:
-    robot = replace(CART, lidar_range=4.0, **changes)
-    lidar = TaskConfig(robot=robot).make_lidar()
-    assert (lidar.sectors, lidar.rays_per_sector, lidar.max_range) == (sectors, each, 4.0)
-    assert lidar.field_of_view == robot.field_of_view
-    other = TaskConfig(robot=robot, lidar={"max_range": 2.0, "sectors": 18}).make_lidar()
-    assert (other.sectors, other.max_range) == (18, 2.0)
-
-
 @pytest.mark.parametrize("robot", ["kobuki", CART, str(EXAMPLE_ROBOT)])
 def test_a_policys_file_alone_drives_its_robot(robot: RobotChoice, tmp_path: Path) -> None:
     task = {"robot": robot, "physics": "kinematic"}
@@ -190,9 +144,3 @@ def test_a_policys_file_alone_drives_its_robot(robot: RobotChoice, tmp_path: Pat
     assert loaded.env_arguments["robot"]["radius"] == resolve_robot(robot).radius
     found = evaluate(loaded, "rooms:validation", episodes=2, max_steps=20)
     assert found == evaluate(policy, "rooms:validation", episodes=2, max_steps=20)
-
-
-def test_a_policy_of_an_unknown_robot_is_rejected() -> None:
-    layers = [Linear(np.zeros((2, 24), np.float32), np.zeros(2, np.float32))]
-    with pytest.raises(ValueError, match=r"robot must be .*got 'burgr'"):
-        Policy(layers, env_arguments={"robot": "burgr"})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,13 +14,9 @@ from mpfa_envs import (
     ROBOTS,
     ROOMS_TASK,
     NavigationEnv,
-    TaskConfig,
     VectorNavigationEnv,
-    generate_world,
     navigation_reward,
 )
-from mpfa_envs.generators.generate import generator_tasks
-from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.tasks.reward import payments_of
 
@@ -56,22 +51,6 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
     many.close()
 
 
-@pytest.mark.parametrize("robot", [*ROBOTS, replace(ROBOTS["kobuki"], name="cart", radius=0.28)])
-def test_the_task_keeps_its_clearance_of_the_rim_of_each_robot(robot: RobotChoice) -> None:
-    task = TaskConfig(
-        **{name: ROOMS_TASK[name] for name in ROOMS_TASK.keys() - {"world", "max_goal_distance"}}
-        | {"robot": robot}
-    )
-    radius = resolve_robot(robot).radius
-    assert task.collision_distance == pytest.approx(radius + 0.02, abs=1e-12)
-    assert task.closeness_distance == pytest.approx(radius + 0.02, abs=1e-12)
-    judged = replace(task, contact=True)
-    assert (judged.collision_distance, judged.closeness_distance) == (
-        radius,
-        task.closeness_distance,
-    )
-
-
 def test_a_seed_repeats_worlds_that_change_with_each_episode(env: NavigationEnv) -> None:
     seen = []
     for seed in (3, None, None, None, np.int64(3), None):
@@ -81,17 +60,6 @@ def test_a_seed_repeats_worlds_that_change_with_each_episode(env: NavigationEnv)
         seen.append(env.world.name)
     assert len(set(seen[:4])) == 4
     assert seen[4:] == seen[:2]
-
-
-def test_an_episode_can_be_fixed(env: NavigationEnv) -> None:
-    env.reset(seed=0, options={"world": "bars-7"})
-    assert env.world == generate_world("bars", 7)
-    ((world, task),) = generator_tasks("clutter", "validation", worlds=1, tasks=1)
-    env.reset(options={"world": world, **task._asdict()})
-    assert (env.world, env.task) == (world, task)
-    env.reset()
-    assert env.world != world
-    assert env.task != task
 
 
 @pytest.mark.filterwarnings("ignore")

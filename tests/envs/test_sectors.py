@@ -61,12 +61,6 @@ def test_sectors_are_those_of_a_plain_loop(
     assert len(points.angles) == len(points.ranges) and points.ranges.max() <= 10.0
 
 
-def test_what_meets_nothing_is_as_far_as_the_policy_sees() -> None:
-    for nothing in (math.inf, 3.5, 40.0):
-        scan = Scan(-math.pi, math.pi / 90, np.full(180, nothing), 0.1, 3.5)
-        assert (Sectors(card()).read(scan)[0] == 10.0).all()
-
-
 def test_a_sector_between_two_rays_has_the_nearer_one() -> None:
     # A ray every 15 degrees, from -90 to 90: 1 m, 2 m and so on from the right.
     scan = Scan(-math.pi / 2, math.pi / 12, np.arange(1.0, 14.0), 0.0, 100.0)
@@ -124,11 +118,6 @@ def test_around_the_robot_too_near_is_zero_and_silence_nan(
     )
 
 
-def test_rays_that_overlap_a_little_are_a_scan() -> None:
-    scan = Scan(-math.pi, math.tau / 360, np.full(370, 2.0))
-    assert (Sectors(card()).read(scan)[0] == 2.0).all()
-
-
 @pytest.mark.parametrize("gone", [0.0, math.nan])
 def test_a_near_return_stays_while_the_lidar_is_silent_there(gone: float) -> None:
     sectors = Sectors(card(), silent="far")
@@ -144,24 +133,6 @@ def test_a_near_return_stays_while_the_lidar_is_silent_there(gone: float) -> Non
     assert [read(each) for each in (0.15, gone, math.inf, gone)] == [0.15, 0.15, 10.0, 10.0]
 
 
-@pytest.mark.parametrize("silent", ["reject", "far"])
-@pytest.mark.parametrize("mount", [(-0.04, 0.0, 0.0), (0.0, 0.03, 1.0)])
-def test_a_sensor_off_the_center_has_invalid_sectors_as_well(
-    mount: tuple[float, float, float], silent: str
-) -> None:
-    directions = np.arange(-180.0, 180.0, 0.5)
-    ranges = np.full(720, 3.0)
-    seen = (directions + math.degrees(mount[2]) + 180.0) % 360.0 - 180.0
-    ranges[(seen > -0.8) & (seen < 10.8)] = math.nan
-    scan = Scan(-math.pi, math.pi / 360, ranges, 0.1, 8.0)
-    sectors = Sectors(card(), mount=mount, silent=silent)
-    if silent == "far":
-        assert sectors.read(scan)[0][8] == 10.0
-    else:
-        with pytest.raises(ScanError, match="no ray of the sector at 5 degrees is valid"):
-            sectors.read(scan)
-
-
 LIMITS = [(0.1, 0.0), (0.1, -1.0), (5.0, 1.0), (-0.1, 8.0), (math.nan, 8.0), (0.1, math.nan)]
 
 
@@ -170,12 +141,6 @@ def hall(*ranges: float) -> Scan:
     values = np.zeros(360)
     values[: len(ranges)] = ranges
     return Scan(-math.pi, math.pi / 180, values, 0.12, 3.5)
-
-
-def test_a_lidar_that_is_silent_in_a_wide_hall_sees_nothing_near() -> None:
-    sectors = Sectors(card(), silent="far")
-    for scan in (hall(), hall(3.4), hall(), hall(*[math.nan] * 360), hall()):
-        assert (sectors.read(scan)[0] == 10.0).all()
 
 
 @pytest.mark.parametrize("dead", [0.0, math.nan, -math.inf, 0.05])
@@ -282,22 +247,6 @@ def test_a_scan_in_another_unit_is_rejected(
         return
     with pytest.raises(ScanError, match="ranges and range_max must be in meters"):
         Sectors(card()).read(scan)
-
-
-@pytest.mark.parametrize(
-    ("ranges", "end"),
-    [
-        (np.full(360, 65535.0), 25.0),
-        (np.full(360, math.inf), math.inf),
-        (np.where(RANGES > 4.0, 65535.0, RANGES), 25.0),
-        (30.0 + RANGES, 100.0),
-        (RANGES, float(np.finfo(np.float32).max)),
-    ],
-)
-def test_a_scan_of_a_wide_hall_or_with_a_number_for_nothing_is_read(
-    ranges: np.ndarray, end: float
-) -> None:
-    Sectors(card()).read(Scan(-math.pi, math.pi / 180, ranges, 0.1, end))
 
 
 ROOM = World(name="room", size=(5.0, 3.5), boxes=(Box(0.6, -0.5, 0.9, 0.3),))

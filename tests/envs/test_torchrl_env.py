@@ -4,10 +4,8 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
@@ -20,7 +18,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from mpfa_envs import NavigationEnv, NavigationTorchEnv, RobotNoise, make_navigation_env
+from mpfa_envs import NavigationTorchEnv, RobotNoise, make_navigation_env
 from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.tasks.sampling import evaluation_pairs
 
@@ -52,19 +50,6 @@ def test_parallel_environments_have_the_same_face(num_envs: int) -> None:
         env.close()
 
 
-@pytest.mark.parametrize("num_envs", [None, 2])
-def test_a_seed_gives_the_same_episodes_again(num_envs: int | None) -> None:
-    env = make_navigation_env("C", num_envs=num_envs, physics="kinematic")
-    rollouts = []
-    for _ in range(2):
-        env.set_seed(3)
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(20, break_when_any_done=False))
-    assert (rollouts[0] == rollouts[1]).all()
-    if num_envs:
-        assert not torch.equal(rollouts[0]["observation"][0], rollouts[0]["observation"][1])
-
-
 def as_serial() -> SerialEnv:
     return SerialEnv(1, lambda: NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic"))
 
@@ -92,26 +77,6 @@ def test_a_reset_with_a_seed_equals_set_seed_and_reset(make: Callable[[], EnvBas
     with pytest.raises(ValueError, match="seed must be an integer of at least 0, got -1"):
         env.reset(seed=-1)
     env.close()
-
-
-def test_a_seed_is_for_the_robots_that_a_reset_names() -> None:
-    env = make_navigation_env("bars", num_envs=2, physics="kinematic", seed=0)
-    env.reset()
-    mask = TensorDict({"_reset": torch.tensor([[False], [True]])}, [2])
-    before, first = env.env.poses, env.reset(mask.clone(), seed=3)["observation"]
-    assert torch.equal(env.reset(mask.clone(), seed=3)["observation"], first)
-    assert (env.env.poses == before).all(axis=1).tolist() == [True, False]
-
-
-def test_a_time_limit_is_truncated_and_a_collision_terminated() -> None:
-    env = make_navigation_env("A", physics="kinematic", max_steps=4, action_repeat=1, seed=0)
-    env.set_task((0.0, 0.0, 0.0), (3.0, 3.0))
-    last = env.rollout(10)[-1]["next"]
-    assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (1, 0, 1)
-    env.set_task((4.7, 0.0, 0.0), (-3.0, 3.0))
-    last = env.rollout(10)[-1]["next"]
-    assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (0, 1, 1)
-    assert last["info", "collision"].item() and last["reward"].item() == -5.0
 
 
 def test_a_task_holds_for_the_next_episode_only() -> None:
@@ -180,14 +145,6 @@ def test_environments_of_a_creator_start_at_random_without_a_warning() -> None:
     assert not torch.equal(first.reset()["observation"], second.reset()["observation"])
 
 
-def test_what_was_collected_does_not_change_with_the_next_step() -> None:
-    env = make_navigation_env("A", physics="kinematic", seed=0)
-    first = env.reset()
-    kept = first["observation"].clone()
-    env.step(first.set("action", torch.ones(2)))
-    assert torch.equal(first["observation"], kept)
-
-
 def test_info_keys_choose_what_is_handed_on() -> None:
     env = make_navigation_env("A", physics="kinematic", info_keys=("success", "distance"))
     check_env_specs(env)
@@ -214,35 +171,3 @@ def test_the_specs_hold_in_generated_worlds_with_history_and_noise() -> None:
     assert rollout["observation"].isfinite().all()
     assert rollout["next", "done"].sum() >= 6
     assert len({world.name for world in env.env.worlds}) == 3
-
-
-def test_one_robot_has_the_episodes_of_the_environment_for_one() -> None:
-    env = make_navigation_env("D", physics="kinematic", seed=5)
-    single = NavigationEnv(world="D", physics="kinematic")
-    for seed in (5, None):
-        seen, _ = single.reset(seed=seed)
-        np.testing.assert_array_equal(env.reset()["observation"].numpy(), seen)
-
-
-def test_a_task_can_come_with_its_world() -> None:
-    env = make_navigation_env("bars", num_envs=2, physics="kinematic", seed=0)
-    pair = evaluation_pairs("test", 1, seed=0)[0]
-    env.set_task(*pair, index=1, world="test")
-    with pytest.raises(ValueError, match="world must be given"):
-        env.set_task(*pair, index=0)
-    env.reset(TensorDict({"_reset": torch.tensor([[True], [True]])}, [2]))
-    assert [world.name == "test" for world in env.env.worlds] == [False, True]
-    assert env.env.tasks[1] == pair
-
-
-def test_batches_of_robots_can_be_collected_and_flattened() -> None:
-    def make() -> NavigationTorchEnv:
-        return NavigationTorchEnv(num_envs=2, world="A", physics="kinematic", max_steps=8)
-
-    collector = Collector(make, None, frames_per_batch=40, total_frames=80)
-    shapes = [tuple(batch.shape) for batch in collector]
-    collector.shutdown()
-    assert shapes == [(2, 20), (2, 20)]
-    serial = SerialEnv(2, make)
-    assert serial.rollout(10, break_when_any_done=False).shape == (2, 2, 10)
-    serial.close()

@@ -22,7 +22,6 @@ from mpfa_envs import (
     Task,
     VectorNavigationEnv,
     World,
-    generate_world,
     navigation_reward,
 )
 from mpfa_envs.sensing.observation import INFO_TYPES
@@ -73,44 +72,19 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
 
 
 ALONE: list[dict[str, Any]] = [
-    {},
-    {"lidar": {"noise": 0.02}, "action_repeat": 1},
-    {"lidar": {"reduction": "median", "sectors": 6, "rays_per_sector": 4}},
-    {"lidar": {"reduction": "single", "max_range": 2.0}, "robot": "burger"},
-    {"reward": partial(navigation_reward, goal_reward=3.0), "max_steps": 40},
     {"reward": lambda outcome: RewardTerms(other=outcome.clearance), "time_step": 0.2},
-    {"progress": "none", "contact": True},
-    {"progress": "shortest_path", "progress_scale": 7.0},
-    {"memory": "map", "lidar": {"noise": 0.02}},
-    {"memory": "map", "lidar": {"field_of_view": 360.0, "sectors": 36}},
-    {"history": 3},
-    {"history": 3, "memory": "map"},
-    {"noise": ALL, "history": 1},
-    {"noise": ALL, "memory": "map"},
-    {"latency": 0.25},
-    {"noise": RobotNoise(drift=0.1), "memory": "map"},
-    {"noise": RobotNoise(slip=0.2)},
-    {"world": [BUSY] * 4, "contact": True},
-    {"world": [BUSY] * 4, "lidar": {"noise": 0.02}, "memory": "map"},
-    {"world": [BUSY] * 4, "progress": "shortest_path"},
+    {"lidar": {"reduction": "median", "sectors": 6, "rays_per_sector": 4}, "latency": 0.25},
+    {"noise": ALL, "memory": "map", "history": 1},
+    {"world": [BUSY] * 4, "progress": "shortest_path", "contact": True},
     {"world": [POLITE] * 4},
-    {"world": [SCATTERED, "B", SCATTERED, "A"], "progress": "shortest_path", "history": 1},
-    {"world": [generate_world("halls", 2)] * 4, "progress": "shortest_path"},
-    {"physics": "wheels"},
-    {"physics": "wheels", "world": [BUSY] * 4},
+    {"world": [SCATTERED, "B", SCATTERED, "A"], "progress": "shortest_path", "physics": "wheels"},
 ]
 
 
 @pytest.mark.parametrize(
     ("mode", "arguments"),
-    # All of them in one mode, every other one in the second mode, and some in both.
-    [
-        *((MODES[number % 2], arguments) for number, arguments in enumerate(ALONE)),
-        *((mode, {}) for mode in MODES[1:]),
-        (MODES[0], {"physics": "wheels"}),
-        (MODES[0], {"noise": ALL, "memory": "map"}),
-    ],
-    ids=lambda value: "-".join(value) or "defaults" if isinstance(value, dict) else value.name,
+    [(MODES[number % 2], arguments) for number, arguments in enumerate(ALONE)],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else value.name,
 )
 def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments: dict) -> None:
     arguments = {"physics": "kinematic", "world": NAMES, "max_steps": 60} | arguments
@@ -269,13 +243,13 @@ def test_the_time_limit_of_gymnasium_is_that_of_one_environment(words, actions) 
     many.close()
 
 
-@pytest.mark.parametrize("limit", [0, 1.5, "7", -2])
+@pytest.mark.parametrize("limit", [0, "7"])
 def test_a_time_limit_that_is_no_count_is_rejected_by_name(limit) -> None:
     with pytest.raises(ValueError, match="max_episode_steps"):
         gymnasium.make_vec("mpfa/Navigation-A-v1", num_envs=2, max_episode_steps=limit)
 
 
-@pytest.mark.parametrize("env_id", [f"mpfa/Navigation-{name}-v1" for name in WORLDS])
+@pytest.mark.parametrize("env_id", [f"mpfa/Navigation-{name}-v1" for name in ("A", "test")])
 def test_every_world_has_an_id_of_a_vector_environment(env_id: str) -> None:
     env = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
     assert isinstance(env.unwrapped, VectorNavigationEnv)

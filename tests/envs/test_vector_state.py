@@ -16,13 +16,11 @@ from gymnasium.vector import AutoresetMode
 
 from mpfa_envs import (
     ROBOTS,
-    WORLDS,
     Box,
     RewardTerms,
     RobotNoise,
     Task,
     VectorNavigationEnv,
-    Walker,
     World,
     navigation_reward,
 )
@@ -221,40 +219,3 @@ def test_an_episode_of_options_is_saved_only_after_the_next_reset(options: dict[
     assert same(env.reset()[:1], [env.observations])
     other.load_state_dict(env.state_dict())
     assert same(drive(other, 0, 5), drive(env, 0, 5))
-
-
-def state_in(world: World) -> dict[str, Any]:
-    env = VectorNavigationEnv(1, world=world, physics="kinematic")
-    env.reset(seed=0)
-    return env.state_dict()
-
-
-def test_equal_worlds_alone_take_the_state_of_each_other() -> None:
-    region, walker = Box(-3, -2, -2, 2), Walker(radius=1, speed=1)
-    whole = World(name="hall", size=(8, 6), boxes=(Box(1, 1, 2, 2),), start_regions=(region,))
-    again = World(
-        name="hall",
-        size=(8.0, 6.0),
-        boxes=(Box(1.0, 1.0, 2.0, 2.0),),
-        start_regions=(Box(-3.0, -2.0, -2.0, 2.0),),
-    )
-    walked, slower = (replace(whole, walkers=(walker, replace(walker, speed=s))) for s in (1, 0.5))
-    alike = {
-        whole.name: again,
-        "walked": replace(walked, walkers=(Walker(radius=1.0, speed=1.0),) * 2),
-    }
-    for name, world in {whole.name: whole, "walked": walked}.items():
-        VectorNavigationEnv(1, world=alike[name], physics="kinematic").load_state_dict(
-            state_in(world)
-        )
-    others = [
-        replace(whole, boxes=()),
-        replace(whole, start_regions=()),
-        walked,
-        slower,
-        *WORLDS.values(),
-    ]
-    for world in others:
-        env = VectorNavigationEnv(1, world=world, physics="kinematic")
-        with pytest.raises(ValueError, match=r"world = '.*', got one with 'hall \("):
-            env.load_state_dict(state_in(whole))

@@ -21,14 +21,12 @@ from mpfa_envs import (
     evaluate,
     summarize,
 )
-from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import WALKER
-from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.walkers.loops import time_to_collision
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.batch import WorldBatch
-from tests.envs.busy import BUSY, POLITE, ROUND, STANDING
+from tests.envs.busy import BUSY, POLITE, ROUND
 
 
 def batch_of(world: World, seed: int = 0, time_step: float = 0.1) -> WalkerBatch:
@@ -75,14 +73,6 @@ def test_straight_walkers_run_into_nothing_and_never_stop_for_long(seed: int) ->
     speeds = np.array([walker.speed for walker in world.walkers])
     np.testing.assert_array_less(0.9 * 100 * speeds, path)
     assert (np.hypot(seen[..., 2], seen[..., 3]) - speeds).max() < 1e-9
-
-
-def test_a_walker_bounces_off_a_thin_wall_in_any_time_step() -> None:
-    wall = Box(-0.01, -2.0, 0.01, 2.0)
-    world = World(name="halves", size=(8.0, 4.0), boxes=(wall,), walkers=(Walker(speed=2.0),))
-    batch = batch_of(world, time_step=1.0)
-    side = np.sign(batch.of(0)[0, 0])
-    assert (np.sign(walk(batch, 300)[:, 0, 0]) == side).all()
 
 
 def test_a_walker_goes_its_round_at_its_speed() -> None:
@@ -184,30 +174,6 @@ def test_walkers_are_seen_and_run_into_as_cylinders_would_be() -> None:
     assert collisions > 2
 
 
-def test_a_map_holds_what_stands_and_no_walker() -> None:
-    rows = []
-    for world in (BUSY, STANDING):
-        lidar, worlds = Lidar(STANDING, noise=0.01), WorldBatch([world])
-        memory = MapMemory(1, ROBOTS["turtlebot2"], lidar)
-        memory.begin(0, world)
-        batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-        batch.begin(0, start_walkers(world, (0.0, -1.0), np.random.default_rng(0)))
-        rng, hits = np.random.default_rng(1), 0
-        for heading in np.linspace(-3.0, 3.0, 60):
-            batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
-            motions = np.array([[0.0, -1.0, heading, 0.0, 0.0]])
-            circles = batch.of(0)[:, [0, 1, 4]]
-            ranges = lidar.measure(*motions[0, :3], rng=rng, moving=circles)[None]
-            seen = batch.without(motions, lidar, ranges)
-            hits += int((seen != ranges).sum())
-            memory.remember(motions, np.array([[4.0, 4.0]]), seen)
-        rows.append(memory.arrays.levels[0] > 0)
-        assert (hits > 100) == bool(world.walkers)
-    # What a walker hid from view is not there; nothing else is.
-    assert rows[0].sum() > 0.9 * rows[1].sum()
-    assert not (rows[0] & ~rows[1]).any()
-
-
 def test_a_robot_that_waits_keeps_its_scans_and_its_walkers() -> None:
     env = VectorNavigationEnv(2, world=BUSY, physics="kinematic", history=3)
     env.reset(seed=0)
@@ -266,15 +232,6 @@ def test_encounters_are_counted_over_an_episode() -> None:
             assert info["walker_distance"] == pytest.approx(nearest, abs=1e-9)
             assert info["intrusion_time"] == pytest.approx(0.1 * near)
             assert info["time_to_collision"] == pytest.approx(least, abs=1.1e-3)
-
-
-def test_without_walkers_there_are_no_encounters() -> None:
-    env = VectorNavigationEnv(1, world=STANDING, physics="kinematic")
-    env.reset(seed=0)
-    infos = env.step(np.ones((1, 2)))[-1]
-    met = [infos[key][0] for key in ("walker_distance", "intrusion_time", "time_to_collision")]
-    assert met == [10.0, 0.0, 10.0]
-    assert env.walkers(0).shape == (0, 5)
 
 
 def test_results_tell_of_walkers_if_there_are_any() -> None:

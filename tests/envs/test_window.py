@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.play import PlayableGame
 
-from mpfa_envs import NavigationEnv, VectorNavigationEnv
+from mpfa_envs import NavigationEnv
 from mpfa_envs.scene.window import Window
 from tests.envs.process import run
 
@@ -59,17 +59,6 @@ def test_a_room_of_a_generator_is_shown_as_well() -> None:
     env.close()
 
 
-def test_pictures_a_second_are_those_of_real_time() -> None:
-    for mode, fps in (("human", 5), ("rgb_array", 5)):
-        env = NavigationEnv(physics="kinematic", render_mode=mode)
-        assert env.metadata["render_fps"] == fps
-        assert NavigationEnv.metadata["render_modes"] == ["human", "rgb_array"]
-    robots = VectorNavigationEnv(1, physics="kinematic", action_repeat=1)
-    assert robots.metadata["render_fps"] == 10
-    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
-        VectorNavigationEnv(1, physics="kinematic", render_mode="human")
-
-
 def test_the_window_waits_until_a_picture_is_due() -> None:
     window = Window("test", fps=20)
     start = time.perf_counter()
@@ -91,15 +80,6 @@ def test_the_window_knows_the_keys_that_are_held() -> None:
     pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_LEFT))
     window.show(picture)
     assert window.keys == {"up"} and window.pressed == []
-    window.close()
-
-
-def test_a_picture_of_another_size_resizes_the_window() -> None:
-    window, rng = Window("test", fps=1000), np.random.default_rng(0)
-    for height, width in ((40, 60), (50, 30)):
-        picture = rng.integers(0, 256, (height, width, 3), np.uint8)
-        assert window.show(picture)
-        np.testing.assert_array_equal(on_screen(), picture)
     window.close()
 
 

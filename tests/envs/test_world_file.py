@@ -179,18 +179,6 @@ def test_a_large_region_without_room_is_rejected_soon(
     assert time.process_time() - start < 10.0
 
 
-def test_a_region_with_a_little_room_somewhere_is_taken(tmp_path: Path) -> None:
-    text = """size: [200, 200]
-boxes:
-  - {x_min: -100, x_max: 63.1, y_min: -100, y_max: 100}
-  - {x_min: 64.2, x_max: 100, y_min: -100, y_max: 100}
-start:
-  - {x_min: -90, x_max: 90, y_min: -90, y_max: 90}
-"""
-    (tmp_path / "slit.yaml").write_text(text)
-    assert len(load_world(tmp_path / "slit.yaml").start_regions) == 1
-
-
 @pytest.mark.parametrize(
     ("world", "message"),
     [
