@@ -58,11 +58,6 @@ def reasons(controller: Controller, times: Sequence[float]) -> list[str | None]:
     return [None if order is None else order.reason for order in orders]
 
 
-def test_it_drives_when_it_has_all_that_it_needs() -> None:
-    controller, _ = ready()
-    assert controller.tick(10.0) == Order(0.5, 0.0, "driving")
-
-
 def test_an_order_holds_until_the_next_decision_is_due() -> None:
     controller, asked = ready()
     times = [10.0, 10.05, 10.1, 10.15, 10.17, 10.2, 10.3, 10.35]
@@ -109,17 +104,6 @@ def test_it_waits_for_the_first_scan_and_odometry() -> None:
     assert controller.tick(10.0) == Order(0.0, 0.0, "no odometry")
     controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
     assert reasons(controller, [10.0]) == ["driving"]
-
-
-def test_a_stale_scan_stops_it_until_another_comes() -> None:
-    controller, asked = ready(scan_timeout=0.3, odometry_timeout=9.0)
-    assert reasons(controller, [10.0, 10.29, 10.31]) == [
-        "driving", "driving", "stale scan: 0.3 s old",
-    ]  # fmt: skip
-    before = len(asked)
-    controller.see(scan(), 10.4)
-    assert reasons(controller, [10.4]) == ["driving"]
-    assert len(asked) == before + 1  # What it wanted before the stop is not taken up.
 
 
 @pytest.mark.parametrize(
@@ -188,7 +172,7 @@ def test_what_a_filter_allows_is_driven_and_without_one_an_obstacle_leaves_the_t
 
 @pytest.mark.parametrize(
     ("robot", "every", "delay"),
-    [("turtlebot2", 5, 0), ("turtlebot2", 10, 5), ("turtlebot4", 7, 7), ("burger", 10, 10)],
+    [("turtlebot2", 10, 5), ("burger", 10, 10)],
 )
 def test_a_wall_is_not_touched_however_late_scans_are(robot: str, every: int, delay: int) -> None:
     pilot = Pilot(card(), lambda seen: np.ones((1, 2), np.float32), robot=robot)
@@ -258,26 +242,6 @@ def test_a_late_scan_enters_the_map_where_it_was_taken(late: float) -> None:
     assert entered == [pytest.approx(want, abs=1e-6)]
 
 
-def test_odometry_that_jumps_gives_up_the_goal() -> None:
-    controller, _ = ready((3.0, 2.0, 1.0))
-    controller.tick(10.0)
-    controller.feel((3.02, 2.01, 1.0), (0.5, 0.0), 10.05)
-    assert reasons(controller, [10.05]) == ["driving"]
-    controller.feel((math.nan, 0.0, 0.0), (0.5, 0.0), 10.07)
-    controller.feel((0.0, 0.0, 0.0), (0.5, 0.0), 10.1)
-    assert controller.tick(10.1) == Order(0.0, 0.0, "odometry jumped: 3.6 m in 0.05 s")
-    assert controller.tick(10.15) is None
-    controller.aim((4.0, 0.0))
-    assert reasons(controller, [10.2]) == ["driving"]
-
-
-def test_odometry_that_comes_late_has_not_jumped() -> None:
-    controller, _ = ready()
-    controller.feel((0.9, 0.0, 0.0), (0.5, 0.0), 11.0)
-    controller.see(scan(), 11.0)
-    assert reasons(controller, [11.0]) == ["driving"]
-
-
 def test_what_is_held_stands_still_until_it_is_let_go() -> None:
     controller, asked = ready()
     controller.tick(10.0)
@@ -290,17 +254,7 @@ def test_what_is_held_stands_still_until_it_is_let_go() -> None:
     assert reasons(controller, [10.15]) == ["driving"]
 
 
-@pytest.mark.parametrize("field_of_view", [180.0, 360.0])
-def test_what_is_behind_does_not_stop_it(field_of_view: float) -> None:
-    controller, _ = ready(field_of_view=field_of_view)
-    values = np.full(360, 3.0)
-    values[:80] = 0.2
-    controller.see(Scan(-math.pi, math.pi / 180, values), 10.0)
-    assert reasons(controller, [10.0]) == ["driving"]
-
-
-@pytest.mark.parametrize("place", range(5))
-@pytest.mark.parametrize("number", [math.nan, math.inf])
+@pytest.mark.parametrize(("place", "number"), [(1, math.nan), (2, math.inf), (4, math.nan)])
 def test_odometry_that_is_not_finite_stops_it(place: int, number: float) -> None:
     controller, _ = ready()
     values = [0.0] * 5
@@ -309,13 +263,11 @@ def test_odometry_that_is_not_finite_stops_it(place: int, number: float) -> None
     assert controller.tick(10.0) == Order(0.0, 0.0, "odometry is not finite")
 
 
-@pytest.mark.parametrize("corrected", [False, True])
 @pytest.mark.parametrize(
-    ("goal", "message"),
+    ("goal", "message", "corrected"),
     [
-        ((math.nan, 0.0), "goal must be a finite number, got nan"),
-        ((math.inf, 0.0), "goal must be a finite number, got inf"),
-        ((1e300, 0.0), "goal must be within 1e+07 m of the origin, got (1e+300, 0.0)"),
+        ((math.nan, 0.0), "goal must be a finite number, got nan", False),
+        ((1e300, 0.0), "goal must be within 1e+07 m of the origin, got (1e+300, 0.0)", True),
     ],
 )
 def test_a_goal_that_no_observation_holds_gives_up_the_goal(
@@ -337,12 +289,6 @@ def test_a_goal_can_be_corrected_only_if_there_is_one() -> None:
     controller.aim(None)
     controller.correct_goal((1.0, 1.0))
     assert controller.pilot.goal is None
-
-
-def test_a_scan_that_tells_too_little_stops_it() -> None:
-    controller, _ = ready()
-    controller.see(scan(*[math.nan] * 20), 10.0)
-    assert reasons(controller, [10.0]) == ["no ray of the sector at 5 degrees is valid"]
 
 
 def names(**values: Any) -> SimpleNamespace:
@@ -377,13 +323,9 @@ def wander(controller: Controller, times: range, reach: float) -> list[str | Non
     return found
 
 
-@pytest.mark.parametrize(
-    ("reach", "robot", "after"), [(0.2, "turtlebot2", 80), (2.0, "burger", 182)]
-)
-def test_a_robot_that_comes_nowhere_new_gives_up_the_goal(
-    reach: float, robot: str, after: int
-) -> None:
-    controller, _ = ready(robot=robot)
+def test_a_robot_that_comes_nowhere_new_gives_up_the_goal() -> None:
+    controller, _ = ready()
+    after, reach = 80, 0.2
     found = wander(controller, range(100, 100 + 15 * after), reach)
     driving = found.index("no progress: time for 40 m, and no new place")
     assert set(found[:driving]) == {"driving"} and found[driving + 1] is None
@@ -403,13 +345,3 @@ def test_a_robot_that_stands_before_an_obstacle_gives_up_the_goal_in_the_end() -
     given_up = Order(0.0, 0.0, "stands still: time for 40 m, and no new place")
     assert found[:800] == [stopped] * 800
     assert given_up in found and found[-1] is None and set(found) == {stopped, given_up, None}
-
-
-def test_coming_to_new_places_is_no_lack_of_progress() -> None:
-    controller, _ = ready()
-    controller.aim((40.0, 0.0))
-    for time in range(2000, 3500):
-        controller.see(scan(free=3.0 + 0.001 * (time % 7)), 0.1 * time)
-        controller.feel((0.01 * (time - 2000), 0.0, 0.0), (0.1, 0.0), 0.1 * time)
-        assert controller.tick(0.1 * time) is not None
-    assert controller.pilot.goal is not None

@@ -91,9 +91,15 @@ def blind(range_min: float, tells: float | None) -> Sees:
     return sees
 
 
-@pytest.mark.parametrize("silent", ["reject", "far"])
-@pytest.mark.parametrize("world", [HALL, POST], ids=lambda world: world.name)
-@pytest.mark.parametrize("tells", [math.nan, 0.0, -1.0, -math.inf, None])
+@pytest.mark.parametrize(
+    ("tells", "world", "silent"),
+    [
+        (math.nan, POST, "reject"),
+        (0.0, HALL, "far"),
+        (-math.inf, POST, "far"),
+        (None, HALL, "reject"),
+    ],
+)
 def test_it_stops_for_what_is_too_near_for_its_sensor(
     tells: float | None, world: World, silent: Silent
 ) -> None:
@@ -162,12 +168,6 @@ def test_equal_scans_while_standing_do_not_stop_it() -> None:
     assert loop.robot.motion.x > -1.0 and set(loop.told) == {"driving"}
 
 
-def test_equal_scans_of_free_space_do_not_stop_it() -> None:
-    loop = Loop(world=World(name="field", size=(60.0, 60.0)), max_range=10.0)
-    loop.run(6.0)
-    assert loop.robot.motion.x > 0.9 and set(loop.told) == {"driving"}
-
-
 @pytest.mark.parametrize("behind", [1, 2])
 def test_odometry_that_lags_does_not_make_a_scan_repeat_itself(behind: int) -> None:
     loop = Loop(start=(13.5, 0.0, 0.0), goal=(14.9, 0.0), goal_radius=0.01)
@@ -221,7 +221,7 @@ def test_odometry_that_contradicts_the_wheels_gives_up_the_goal(
     assert loop.stands and loop.robot.motion.x - start < farthest
 
 
-@pytest.mark.parametrize("speeds", [(-1e9, 0.0), (1e9, 0.0), (0.5, -40.0)])
+@pytest.mark.parametrize("speeds", [(-1e9, 0.0), (0.5, -40.0)])
 def test_impossible_speeds_stop_it_while_they_last(
     speeds: tuple[float, float],
 ) -> None:
@@ -231,12 +231,6 @@ def test_impossible_speeds_stop_it_while_they_last(
     assert loop.stands and loop.told[-1] == "odometry too fast"
     loop.run(0.5)
     assert loop.told[-1] == "driving"
-
-
-def test_turning_or_standing_on_order_does_not_count_as_stalled() -> None:
-    loop = Loop(lambda _: np.array([[-1.0, 1.0]], np.float32), learned=still_wheels(-0.5))
-    loop.run(5.0)
-    assert set(loop.told) == {"driving"}
 
 
 def failing(result: Any) -> Any:
@@ -297,28 +291,22 @@ def three_turns(scan: Scan, _: float) -> Scan:
     return scan._replace(ranges=np.tile(np.asarray(scan.ranges), 3))
 
 
-@pytest.mark.parametrize("sees", [degrees, three_turns])
-def test_a_scan_of_several_turns_stops_it(sees: Sees) -> None:
-    loop = Loop()
-    order = loop.run(0.5, sees)
-    assert order is not None and order.reason.startswith("the rays of a scan must go round once")
-    assert loop.stands
-
-
 def millimeters(scan: Scan, _: float) -> Scan:
     return scan._replace(ranges=1000.0 * np.asarray(scan.ranges))
 
 
-def limits_too(scan: Scan, time: float) -> Scan:
-    limits = 1000.0 * scan.range_min, 1000.0 * scan.range_max
-    return millimeters(scan, time)._replace(range_min=limits[0], range_max=limits[1])
-
-
-@pytest.mark.parametrize("sees", [millimeters, limits_too])
-def test_a_scan_in_millimeters_stops_it(sees: Sees) -> None:
+@pytest.mark.parametrize(
+    ("sees", "reason"),
+    [
+        (degrees, "the rays of a scan must go round once"),
+        (three_turns, "the rays of a scan must go round once"),
+        (millimeters, "ranges and range_max must be in meters"),
+    ],
+)
+def test_a_scan_in_another_unit_stops_it(sees: Sees, reason: str) -> None:
     loop = Loop()
     order = loop.run(0.5, sees)
-    assert order is not None and order.reason.startswith("ranges and range_max must be in meters")
+    assert order is not None and order.reason.startswith(reason)
     assert loop.stands
 
 
@@ -327,7 +315,7 @@ def still_wheels(slowest: float = 0.0) -> Any:
     return replace(ROBOTS["turtlebot2"], min_wheel_speed=slowest)
 
 
-@pytest.mark.parametrize("tells", [None, -math.inf, math.nan, 0.0])
+@pytest.mark.parametrize("tells", [None, math.nan])
 def test_a_robot_that_reverses_stops_for_what_is_behind(tells: float | None) -> None:
     loop = Loop(lambda seen: -ahead(seen), start=(-13.0, 0.0, 0.0), learned=still_wheels(-0.5))
     loop.run(5.0, blind(0.3, tells))

@@ -58,13 +58,6 @@ def test_parameter_files_fit_the_node_and_the_shipped_policies(file: Path) -> No
     Controller(pilot, stop_distance=values["stop_distance"])
 
 
-def test_parameters_are_addressed_to_the_node_by_its_name() -> None:
-    source = (FOLDER / "policy_node.py").read_text(encoding="utf-8")
-    (name,) = re.findall(r'super\(\).__init__\("(\w+)"\)', source)
-    for file in (FOLDER / "launch").glob("*.yaml"):
-        assert set(yaml.safe_load(file.read_text(encoding="utf-8"))) == {name}
-
-
 def test_commands_in_the_docs_name_what_exists() -> None:
     root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
     declared = {each.get("name") for each in root.iter("arg")}

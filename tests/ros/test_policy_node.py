@@ -132,29 +132,6 @@ def test_it_stops_the_robot_when_it_is_told_to_end(module: Any, world: World, na
     assert world.sent[-1] == STANDS
 
 
-def test_a_hangup_that_is_ignored_does_not_end_it(module: Any, world: World) -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    ended = []
-
-    def spin(node: Any) -> None:
-        signal.raise_signal(signal.SIGHUP)
-        ended.append(False)
-
-    world.spin = spin
-    module.main()
-    assert ended == [False]
-
-
-def test_a_stop_that_fails_does_not_hide_why_it_died(module: Any, world: World) -> None:
-    def spin(node: Any) -> None:
-        world.broken = True
-        raise KeyError("why")
-
-    world.spin = spin
-    with pytest.raises(KeyError, match="why"):
-        module.main()
-
-
 def test_a_check_that_fails_stops_the_robot_and_is_logged(
     module: Any, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,12 +159,6 @@ def test_an_old_transform_stops_it_until_a_new_one_comes(module: Any, world: Wor
     world.transform = None
     assert feed(node, world, 12.0) == DRIVES
     assert feed(node, world, 12.2) == STANDS
-
-
-def test_a_transform_that_never_changes_stays_valid(module: Any, world: World) -> None:
-    world.transform = transform(0.0)
-    node = driving(module, world, "map")
-    assert feed(node, world, 70.0) == DRIVES
 
 
 def test_without_stamps_a_transform_ages_from_when_it_last_came(module: Any, world: World) -> None:
@@ -252,18 +223,6 @@ def test_a_rate_of_zero_is_rejected(module: Any, world: World) -> None:
     world.parameters["rate"] = 0.0
     with pytest.raises(ValueError, match="rate must be positive, got 0"):
         module.PolicyNode()
-
-
-def test_an_abandoned_goal_is_not_taken_up_again(module: Any, world: World) -> None:
-    world.transform = transform(10.0)
-    node = driving(module, world, "map")
-    node._on_odometry(odometry(10.05, x=3.0))
-    node._tick()
-    assert world.sent[-1] == STANDS
-    assert world.logged[-1] == ("info", "odometry jumped: 3.0 m in 0.05 s")
-    world.now = 10.1
-    node._tick()
-    assert node.controller.pilot.goal is None
 
 
 def turning_robot(tmp_path: Path, **arguments: Any) -> str:
