@@ -151,14 +151,6 @@ def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
     assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
 
 
-def test_annealing_by_a_fraction_outside_of_0_to_1_changes_nothing():
-    replay = make_replay("per", capacity=100)
-    for fraction in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got"):
-            replay.anneal(fraction)
-    assert replay.buffer.sampler.beta == replay.method.beta
-
-
 @pytest.mark.parametrize("name", ["uniform", "pal", "cer"])
 def test_annealing_without_priorities_does_nothing(name):
     make_replay(name, capacity=100).anneal(1.0)

@@ -20,11 +20,6 @@ def test_newest_transition_is_in_every_batch_across_the_wrap():
         assert int(buffer.sample()["index"][0]) == slot
 
 
-def test_last_of_several_transitions_is_the_newest():
-    buffer = make_combined(10, 3, 4)
-    assert int(buffer.sample()["index"][0]) == 3
-
-
 def test_transitions_but_the_newest_are_sampled_uniformly():
     buffer = make_combined(8, 4001, 8)
     others = torch.cat([buffer.sample()["index"][1:] for _ in range(5)])

@@ -44,17 +44,6 @@ def test_frequencies_are_those_of_the_law_across_the_wrap(recency, capacity, wri
     assert_shares(buffer.sample()["index"], shares_of_slots(recency, order), samples=SAMPLES)
 
 
-@pytest.mark.parametrize("rate", [0.0, 1e-9, 3e-5, 0.3, 0.999])
-def test_age_is_the_first_whose_cumulative_probability_exceeds_the_share(rate):
-    law = law_by_hand(rate, 50)
-    shares = torch.rand(200, generator=seeded(1), dtype=torch.double)
-    for share, found in zip(
-        shares.tolist(), geometric_age(shares, rate=rate, count=50).tolist(), strict=True
-    ):
-        below = sum(law[:found])
-        assert below - 1e-6 <= share < below + law[found] + 1e-6
-
-
 def test_no_share_leads_beyond_the_oldest_transition():
     share = torch.tensor([0.0, 1.0 - 2**-53], dtype=torch.double)
     for rate in (0.0, 1e-12, 0.5):

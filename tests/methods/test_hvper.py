@@ -6,14 +6,12 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer
-from tests.mpfa.transitions import make_transitions, seeded
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
     HVPERPenalty,
-    relative_error,
-    relative_value,
     value_schedule,
 )
 
@@ -62,25 +60,6 @@ def test_priorities_are_those_of_the_formula(fraction):
     found = -torch.as_tensor(sampler._max_tree[index])
     expected = by_hand(values.tolist(), errors.tolist(), counts.tolist(), fraction)
     assert found.tolist() == pytest.approx(expected, abs=1e-5)
-
-
-def test_value_and_error_are_between_zero_and_one():
-    for function in (relative_value, relative_error):
-        for data in (torch.rand(9, generator=seeded(3)) * 100, torch.zeros(4), torch.ones(1)):
-            found = function(data)
-            assert ((found >= 0) & (found <= 1)).all()
-
-
-def test_negative_value_is_no_error_as_only_its_place_is_kept():
-    sampler = SignalSampler(
-        4, 0.6, 0.4, EPS, signals=[RELATIVE_VALUE, RELATIVE_ERROR], fusion=value_schedule()
-    )
-    buffer = make_buffer(sampler, 4, 4, filled=0)
-    buffer.extend(make_transitions(4))
-    batch = buffer.sample()
-    batch["signals", "value"] = torch.full((4,), -50.0)
-    batch["signals", "td_error"] = torch.ones(4)
-    buffer.update_tensordict_priority(batch)
 
 
 def relative_errors(batches, errors, *, stale=()):

@@ -53,26 +53,6 @@ def test_parts_are_right_after_the_ring_buffer_has_wrapped():
     assert_parts(buffer, errors, samples=20_000)
 
 
-def test_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
-    first, second = (make_la3p(50, 40_000, filled=9 if n == 0 else 0) for n in range(2))
-    errors = torch.rand(9, generator=seeded(5)) * 10
-    set_signals(first, td_error=errors)
-    second.load_state_dict(first.state_dict())
-    for buffer in (first, second):
-        assert_parts(buffer, errors, samples=20_000)
-
-
-@pytest.mark.parametrize(("fraction", "expected"), [(0.5, (128, 128, 128)), (0.25, (64, 192, 192))])
-def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
-    buffer = make_la3p(300, 256, uniform_fraction=fraction)
-    draws = list(la3p_batches(buffer))
-    assert tuple(len(draw.batch) for draw in draws) == expected
-    assert [draw.trains for draw in draws] == ["both", "critic", "actor"]
-    assert [draw.loss_function for draw in draws][:2] == ["pal", "smooth_l1"]
-    assert [draw.new_step for draw in draws] == [True, False, False]
-    assert [draw.gives_signals for draw in draws] == [True, True, False]
-
-
 def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)
@@ -155,30 +135,9 @@ def test_halves_make_as_many_updates_on_as_many_transitions_as_la3p():
     assert steps_of("ddpg") == ({"critic": 32, "actor": 32}, {"critic": 1, "actor": 1})
 
 
-def test_both_halves_are_uniform():
-    replay = make_replay("uniform_halves", capacity=10, batch_size=40_000)
-    replay.buffer.extend(make_transitions(10))
-    draws = list(replay.select(replay.buffer))
-    assert [draw.trains for draw in draws] == ["both", "both"]
-    assert [draw.new_step for draw in draws] == [True, False]
-    for draw in draws:
-        shares = torch.bincount(draw.batch["index"], minlength=10) / len(draw.batch)
-        assert (shares - 0.1).abs().max() < 0.01
-
-
 def test_odd_batch_is_split_and_a_single_transition_is_rejected():
     buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
     assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
     alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)
     with pytest.raises(ValueError, match="batch_size must be at least 2 for two halves, got 1"):
         next(uniform_halves(alone))
-
-
-def test_la3p_without_an_exponent_samples_all_its_parts_uniformly():
-    """The other control: everything of LA3P, losses and order, but the priorities."""
-    replay = make_replay("la3p", capacity=10, batch_size=80_000, alpha=0.0)
-    replay.buffer.extend(make_transitions(10))
-    set_signals(replay.buffer, td_error=torch.arange(10.0) ** 3)
-    for draw in replay.select(replay.buffer):
-        shares = torch.bincount(draw.batch["index"], minlength=10) / len(draw.batch)
-        assert (shares - 0.1).abs().max() < 0.01

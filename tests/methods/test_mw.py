@@ -84,16 +84,6 @@ def test_update_that_raises_uses_no_transition_up():
     assert not buffer.sampler._spent.any()
 
 
-def test_weights_are_relative_to_the_lowest_share_that_can_be_sampled():
-    buffer = make_capped(10, 3, 2)
-    set_signals(buffer, td_error=torch.arange(1.0, 11.0))
-    for _ in range(3):
-        train(buffer, td_error=2.0)
-        weight = buffer.sample()["priority_weight"]
-        assert weight.isfinite().all()
-        assert ((weight > 0) & (weight <= 1 + 1e-6)).all()
-
-
 def test_both_terms_are_divided_by_their_means_and_count_the_same():
     buffer = make_capped(5, 2, 100)
     errors = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])

@@ -36,15 +36,6 @@ def test_transitions_are_sampled_by_their_rank():
     assert_shares(buffer.sample()["index"], expected, samples=50_000)
 
 
-def test_outlier_changes_nothing_but_its_own_rank():
-    errors = torch.arange(1.0, 9.0)
-    buffers = [make_buffer(make_sampler(8, rank_refresh=0), 8, 1000) for _ in range(2)]
-    set_signals(buffers[0], td_error=errors)
-    errors[-1] = 1e6
-    set_signals(buffers[1], td_error=errors)
-    assert torch.equal(*(buffer.sample()["index"] for buffer in buffers))
-
-
 def test_equal_priorities_have_one_share_that_of_their_mean_rank():
     sampler = make_sampler(1000)
     sampler.mark_update(torch.arange(1000))
@@ -54,17 +45,6 @@ def test_equal_priorities_have_one_share_that_of_their_mean_rank():
     leaves = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(6)])
     ranks = torch.tensor([4.0, 2.0, 6.0, 4.0, 1.0, 4.0], dtype=torch.double)
     torch.testing.assert_close(leaves, ranks.pow(-ALPHA))
-
-
-def test_priority_that_stays_keeps_its_share_between_two_sortings():
-    buffer = make_buffer(make_sampler(6, rank_refresh=0), 6, 4)
-    errors = torch.tensor([2.0, 5.0, 1.0, 2.0, 9.0, 2.0])
-    set_signals(buffer, td_error=errors)
-    sampler = buffer.sampler
-    before = torch.as_tensor(sampler._sum_tree[torch.arange(6)]).clone()
-    sampler.rank_refresh = 100.0
-    set_signals(buffer, td_error=errors)
-    assert torch.equal(torch.as_tensor(sampler._sum_tree[torch.arange(6)]), before)
 
 
 def test_between_two_sortings_a_priority_gets_the_rank_that_it_would_have_had():

@@ -54,17 +54,6 @@ def rows_near_and_far(learner, shift):
     return rows
 
 
-def test_far_transitions_have_no_weight_and_near_ones_have_all_of_it():
-    learner = make_learner(**loss_options("ref_er"))
-    replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
-    (draw,) = replay.select(replay.buffer)
-    far = (draw.batch["index"] % 2).bool()
-    assert draw.batch["priority_weight"].equal((~far).float())
-    # beta is 0.0001 at first.
-    torch.testing.assert_close(draw.batch["policy_weight"], 1e-4 * (~far).float())
-    torch.testing.assert_close(draw.batch["behavior_weight"], torch.full((COUNT,), 1 - 1e-4))
-
-
 @pytest.mark.parametrize("batches", [0, 4_000_000])
 def test_near_transitions_have_ratios_within_the_limit_and_noise_of_at_least_a_fifth(batches):
     learner = make_learner(**loss_options("ref_er"))
@@ -87,16 +76,6 @@ def test_near_transitions_have_ratios_within_the_limit_and_noise_of_at_least_a_f
         far |= {"low"} if ratio <= 1 / limit else {"high"} if ratio >= limit else {"near"}
         assert float(batch["behavior_sigma"][row]) == pytest.approx(spread)
     assert far == {"low", "high", "near"}
-
-
-def test_rate_of_the_weight_depends_on_the_capacity():
-    learner = make_learner(**loss_options("ref_er"))
-    replay = make_replay("ref_er", capacity=10 * COUNT, batch_size=50, policy=learner.policy)
-    replay.buffer.extend(rows_near_and_far(learner, 1.0))
-    replay.buffer.sampler.policy_weight = 0.5
-    list(replay.select(replay.buffer))
-    rate = 0.1 * 50 / (10 * COUNT)
-    assert replay.buffer.sampler.policy_weight == pytest.approx((1 - rate) * 0.5)
 
 
 def test_far_transitions_teach_neither_critic_nor_actor():
@@ -133,23 +112,6 @@ def test_weight_falls_while_too_many_transitions_are_far():
     list(near.select(near.buffer))
     assert near.buffer.sampler.policy_weight == pytest.approx(0.55)
     assert next_weight(0.5, far=0.1, allowed=0.1, rate=0.2) == pytest.approx(0.6)
-
-
-@pytest.mark.parametrize("rate", [0.0003, 0.1])
-def test_weight_starts_near_zero_and_never_leaves_its_range(rate):
-    """The authors' rule in plain steps, up from their start and down from the end."""
-    weight = ReFERSampler().policy_weight
-    assert weight == 1e-4
-    for far in [0.0] * 200 + [1.0] * 200:
-        up = far <= 0.1
-        step = min(rate, weight)
-        expected = weight - step * weight + (min(rate, 1 - weight) if up else 0.0)
-        weight = next_weight(weight, far=far, allowed=0.1, rate=rate)
-        assert weight == pytest.approx(expected)
-        assert 0 < weight < 1
-    assert next_weight(1e-4, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.1 + 1e-4 - 1e-8)
-    assert next_weight(1e-4, far=1.0, allowed=0.1, rate=0.1) == pytest.approx(1e-4 - 1e-8)
-    assert next_weight(0.999, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.9 * 0.999 + 0.001)
 
 
 def test_loss_of_the_actor_is_that_of_the_formula():
