@@ -72,17 +72,6 @@ def test_time_is_that_over_the_bound_of_the_tasks_that_a_driver_reaches(tmp_path
     assert "| `kobuki` | `mpc --plan known` | no | 1.000 | 1.000 | 2.00 |" in printed
 
 
-def test_robots_that_stood_still_are_told_from_other_timeouts(tmp_path, capsys):
-    write_evaluation(tmp_path / "a", [False, False, True], policy="mpc", robot="kobuki", seed=0)
-    episodes = pd.read_csv(tmp_path / "a/episodes.csv")
-    episodes["collision"], episodes["timeout"] = False, [True, True, False]
-    episodes["standstill"] = [True, False, False]
-    episodes.to_csv(tmp_path / "a/episodes.csv", index=False)
-    drivers.main([str(tmp_path)])
-    printed = capsys.readouterr().out
-    assert "| `kobuki` | `mpc` | no | 0.0% | 100.0% | 0.00% | 33.33% | 33.33% |" in printed
-
-
 def test_errors_and_delays_stand_in_a_table_of_their_own(tmp_path, capsys):
     planner = {"policy": "dwa", "memory": "map", "robot": "kobuki", "seed": 0}
     every = [True, True, True]

@@ -10,17 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from scipy import stats
 
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.answers import answers
-from benchmarks.paper.failures import ratio_interval
-from benchmarks.paper.figures import reward_of_blocks, rewards
 from benchmarks.paper.page import missing_runs, missing_table, question_text, write_page
-from benchmarks.paper.published import NAMES, TABLE_2, TABLE_4, neighbors
+from benchmarks.paper.published import NAMES
 from benchmarks.paper.rows import Rows, keep, keep_time, read_rows
 from benchmarks.paper.runs import CLAIMS, comparisons, question, without
-from benchmarks.paper.tables import comparison_table, difference, measures, unseen_table
+from benchmarks.paper.tables import comparison_table, difference, measures
 from tests.integration.tiny_runs import tiny, train
 from training import files
 from training.comparison.jobs import Job
@@ -116,32 +113,6 @@ def test_page_is_that_of_the_kept_rows(tmp_path: Path) -> None:
             assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 20
 
 
-def test_table_2_has_means_of_runs_and_student_intervals(tmp_path: Path) -> None:
-    rows = made_up(tmp_path, {"ddpg-per": [0.9, 0.8, 0.85], "ddpg-mpfa_per": [0.95]})
-    text = unseen_table(measures(rows), TABLE_2)
-    low, high = stats.t.interval(0.95, 2, 0.85, stats.sem([0.9, 0.8, 0.85]))
-    assert f"| PER | 29 | 30.0 [5.2, 54.8] | 85.5% | 85.0% [{low:.1%}, {high:.1%}] |" in text
-    assert "| MPFA-PER | 19 | 10.0 | 90.5% | 95.0% |" in text
-    assert "| MPF-PER | 21 |  | 89.5% |  | 28.2 |  | 0 |" in text
-
-
-def test_ten_seeds_are_compared_seed_by_seed(tmp_path: Path) -> None:
-    worse = list(np.linspace(0.80, 0.89, 10))
-    better = [share + gap for share, gap in zip(worse, [0.04, 0.06] * 5, strict=True)]
-    rows = made_up(tmp_path, {"ddpg-per": worse, "ddpg-mpfa_per": better})
-    made = difference(measures(rows), "ddpg-mpfa_per", "ddpg-per")
-    assert made is not None
-    assert made.seeds == 10
-    assert made.p == 2 / 2**10
-    assert made.gap.value == pytest.approx(0.05)
-    assert made.gap.high - made.gap.low == pytest.approx(
-        2 * 2.262 * stats.sem([0.04, 0.06] * 5), rel=1e-3
-    )
-    backwards = difference(measures(rows), "ddpg-per", "ddpg-mpfa_per")
-    assert backwards is not None
-    assert backwards.gap.value == pytest.approx(-0.05)
-
-
 def test_five_seeds_are_compared_by_their_means(tmp_path: Path) -> None:
     rows = made_up(tmp_path, {"ddpg-per": [0.5] * 5, "ddpg-mpfa_per": [0.9] * 5})
     made = difference(measures(rows), "ddpg-mpfa_per", "ddpg-per")
@@ -180,17 +151,6 @@ def test_answers_say_where_the_ratio_of_the_paper_lies(
         assert sentence in text
     assert "with more training steps than MPFA-PER, in the mean', '5 of 5', '0 of 5')" in text
     assert "of the paper's order of the methods† is confirmed." in text
-
-
-def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
-    names = ["averaged_ddpg", "per", "hvper", "mw", "ddpg_radam", "td_loss", "td_reward", "klper"]
-    names += ["decay", "raise", "mpf_per", "mpfa_per", "uniform"]
-    noise = np.resize([0.01, -0.01], 10)
-    arms = {f"ddpg-{name}": list(0.3 + 0.05 * i + noise) for i, name in enumerate(names)}
-    rows = made_up(tmp_path, arms)
-    made = answers(rows, measures(rows))[0]
-    assert made.said.startswith("Each step of the paper's order of the methods† is confirmed.")
-    assert [number[2] for number in made.numbers[:2]] == ["6 of 6", "5 of 5"]
 
 
 def asked(folder: Path, shares: dict[str, list[float]]) -> Rows:
@@ -236,39 +196,6 @@ def test_question_with_all_runs_compares_failures_of_new_seeds(tmp_path: Path) -
     assert third.split("|")[5:7] == [" 1.000 ", " 1.000 "]
     # 46 runs: (36 x 4 + 10 x 5) / (36 x 8 + 10 x 5).
     assert "| 0.57 [" in primary
-
-
-def test_ratio_of_failures_resamples_pairs_together() -> None:
-    theirs = np.linspace(0.02, 0.2, 10)
-    paired = ratio_interval(0.5 * theirs, theirs, paired=True)
-    apart = ratio_interval(0.5 * theirs, theirs, paired=False)
-    assert (paired.low, paired.value, paired.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert apart.low < 0.4 < 0.6 < apart.high
-    assert np.isnan(ratio_interval(theirs, 0 * theirs, paired=True).value)
-    assert ratio_interval(theirs, theirs[::-1], paired=False, odds=True).value == 1.0
-
-
-def test_neighbors_follow_success_and_then_time() -> None:
-    assert neighbors()[0] == ("mpfa_per", "mpf_per")
-    assert ("mw", "hvper") in neighbors()
-    assert len(neighbors()) == len(TABLE_2) + len(TABLE_4) - 2
-
-
-def test_rewards_are_summed_in_whole_blocks_and_averaged_by_map() -> None:
-    episodes = pd.DataFrame(
-        {
-            "world": ["A", "A", "B"],
-            "steps": [10, 20, 5],
-            "total_steps": [9_000, 10_000, 12_000],
-            "reward": [5.0, 40.0, 1.0],
-        }
-    )
-    steps, totals = reward_of_blocks(episodes)
-    assert steps.tolist() == [10_000]
-    assert totals.tolist() == [45.0]
-    ((number, values),) = rewards([episodes], "A")
-    assert number.tolist() == [1, 2]
-    assert values.tolist() == [0.5, (0.5 + 2.0) / 2]
 
 
 def test_missing_seeds_of_an_arm_are_in_a_line_of_their_own() -> None:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from benchmarks.speed import (
     disk,
-    leaves,
     method_steps,
     replay,
     run,
@@ -22,7 +20,6 @@ from benchmarks.speed import (
     timing,
     training,
     updates,
-    vector,
 )
 from benchmarks.speed.timing import Entry, Timing, entry
 from torchrl_mpfa.methods import METHODS
@@ -63,13 +60,6 @@ def test_replay_on_disk_says_its_times_and_its_memory_and_leaves_no_file(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_leaves_are_compared_with_trees_where_the_machine_has_them() -> None:
-    entries = leaves.measure(quick=True)
-    check_schema(entries)
-    assert [found["baseline"] for found in entries] == [None, "trees_1e5", None, "trees_1e6"]
-
-
 def test_growth_is_the_time_of_the_largest_buffer_over_that_of_the_smallest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -79,20 +69,6 @@ def test_growth_is_the_time_of_the_largest_buffer_over_that_of_the_smallest(
     assert [found["name"] for found in sizes] == ["step_at_5.12e2", "step_at_4.096e3"]
     assert growth["value"] == pytest.approx(sizes[1]["value"] / sizes[0]["value"])
     assert growth["ratio"] == pytest.approx(growth["value"] / (12 / 9))
-
-
-def test_each_round_of_the_growth_counts_the_entropies(monkeypatch: pytest.MonkeyPatch) -> None:
-    counted: list[int] = []
-    weights = replay.MPFASampler(4).fusion.weights
-
-    def count(self, names, table, index):
-        counted.append(table.size)
-        return weights(names, table, index)
-
-    monkeypatch.setattr("torchrl_mpfa.EntropyFusion.weights", count)
-    monkeypatch.setattr(replay, "SHORTEST_ROUND", 20)
-    replay.measure_growth(capacities=(512, 16_384), quick=True)
-    assert counted.count(16_384) >= 2  # The first one, and at least one in the round.
 
 
 def test_the_run_prints_a_table_and_writes_what_it_measured(
@@ -203,27 +179,8 @@ def test_a_step_of_each_method_is_compared_with_uniform_ddpg() -> None:
     assert {"step_mpfa_per", "step_la3p"} <= set(names)
 
 
-@pytest.mark.parametrize("name", ["ref_er", "reaper", "uniform_halves", "geometric"])
+@pytest.mark.parametrize("name", ["ref_er", "uniform_halves"])
 def test_a_step_is_made_of_methods_that_store_or_choose_in_a_way_of_their_own(name: str) -> None:
     step = method_steps.make_step(replace(METHODS[name]))
     for _ in range(2):
         step()
-
-
-@pytest.mark.slow
-def test_robots_among_walkers_are_compared_with_robots_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    seconds = {"vector_kinematic": 2.0, "vector_walkers": 3.0}
-
-    def turns(calls: dict[str, Callable[[], object]], **named: object) -> dict[str, Timing]:
-        observations: Any = calls["vector_walkers"]()
-        assert observations[0].shape[0] == vector.ROBOTS
-        return {name: Timing((seconds.get(name, 4.0),)) for name in calls}
-
-    monkeypatch.setattr(vector, "take_turns", turns)
-    found = {each["name"]: each for each in vector.measure(quick=True)}
-    check_schema(list(found.values()))
-    assert found["vector_walkers"]["ratio"] == pytest.approx(1.5)
-    assert found["vector_walkers"]["value"] == pytest.approx(vector.ROBOTS / 3.0)
-    assert found["vector_kinematic"]["ratio"] is None

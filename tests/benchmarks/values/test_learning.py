@@ -29,15 +29,6 @@ def test_critics_come_to_the_values_of_the_policy(walk: FrozenBuffer) -> None:
     assert abs(last.bias) < last.rmse
 
 
-@pytest.mark.slow
-def test_a_critic_that_gets_other_rewards_does_not(walk: FrozenBuffer) -> None:
-    shuffled = walk.rows.clone()
-    order = torch.randperm(len(walk), generator=torch.Generator().manual_seed(1))
-    shuffled["next", "reward"] = shuffled["next", "reward"][order]
-    (last,) = learn(replace(walk, rows=shuffled), "per", 0, marks=(400,))
-    assert last.rmse > 0.5 * float(walk.value.std())
-
-
 @pytest.mark.parametrize("marks", [(3,), (0,), (4, 2), ()])
 def test_marks_that_no_update_reaches_are_rejected(marks, walk: FrozenBuffer) -> None:
     with pytest.raises(ValueError, match="marks must be even numbers of updates that rise"):
@@ -136,13 +127,6 @@ def test_a_buffer_is_read_as_it_was_written(walk: FrozenBuffer, tmp_path: Path) 
         assert len(file["last_observation"]) < 0.3 * len(walk)
 
 
-def test_a_folder_without_buffers_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(
-        FileNotFoundError, match=r"no frozen buffers in .* come with the repository"
-    ):
-        frozen_buffers(tmp_path)
-
-
 def test_the_buffers_of_the_project_are_of_runs_with_and_without_dense_rewards() -> None:
     found = {each.name: each for each in frozen_buffers(FOLDER)}
     assert len(found) == 12
@@ -165,11 +149,3 @@ def test_the_error_of_both_images_is_the_mean_of_two_that_are_alone() -> None:
         alone.append(batch["signals", "td_error"])
     assert both_images(learner, rows).allclose(torch.stack(alone).mean(0), rtol=1e-4)
     assert not alone[0].allclose(alone[1])
-
-
-def test_mirrored_batches_are_half_of_what_is_learned_from() -> None:
-    buffer = frozen_buffers(FOLDER)[0]
-    plain, mirrored = (
-        next(learn(buffer, "uniform", 0, mirrored=each, marks=(4,))) for each in (False, True)
-    )
-    assert plain.goals == mirrored.goals and plain.rmse != mirrored.rmse

@@ -136,6 +136,7 @@ def test_what_cannot_be_made_is_rejected(arguments, message, tmp_path, capsys) -
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_page_of_the_table_is_made_of_the_kept_rows() -> None:
     rows = read_rows(FOLDER / "rows.csv")
     retired = rows["method"].str.contains("/noise|^mixture")
