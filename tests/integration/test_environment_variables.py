@@ -9,7 +9,6 @@ import pytest
 
 from training.comparison.execution import Work
 from training.inherited import OF_ONE_RUN, forget_single_run, with_environment
-from training.run.script import train
 from training.run.tracking import Tracker
 from training.settings.train import TrackingSettings, TrainSettings
 
@@ -77,23 +76,6 @@ def test_variable_that_a_setting_overrules_is_named_with_the_setting(
     assert capsys.readouterr().err == f"{name} has no effect, {setting} has\n"
 
 
-@pytest.mark.parametrize(("mode", "given"), [("offline", "dryrun"), ("online", "run")])
-def test_same_mode_by_its_older_name_needs_no_line(
-    mode: str, given: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("WANDB_MODE", given)
-    assert with_environment(TrackingSettings(mode=mode)).mode == mode
-    assert capsys.readouterr().err == ""
-
-
-def test_environment_has_no_word_on_a_run_without_wandb(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("WANDB_MODE", "disabled")
-    assert with_environment(TrackingSettings()).mode == "off"
-    assert capsys.readouterr().err == ""
-
-
 def test_variables_of_a_single_run_are_forgotten_with_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,23 +90,6 @@ def test_variables_of_a_single_run_are_forgotten_with_a_line(
     )
     forget_single_run()
     assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(("seeds", "left"), [("0,1", None), ("0", "callers")])
-def test_sweep_of_several_runs_forgets_the_id_of_its_caller(
-    seeds: str, left: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WANDB_RUN_ID", "callers")
-    monkeypatch.chdir(tmp_path)
-    found: list[str | None] = []
-
-    def main(**_: object) -> object:
-        return lambda _: lambda: found.append(os.environ.get("WANDB_RUN_ID"))
-
-    monkeypatch.setattr("training.run.script.hydra.main", main)
-    monkeypatch.setattr("sys.argv", ["train.py"])
-    train(["-m", f"seed={seeds}"])
-    assert found == [left]
 
 
 def test_work_of_several_runs_forgets_the_id_of_its_caller_before_it_begins(

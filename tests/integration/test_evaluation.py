@@ -6,26 +6,24 @@ import json
 import threading
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
 
 import evaluate
-from mpfa_envs import GENERATORS, load_policy, save_policy, world_tasks
+from mpfa_envs import GENERATORS, load_policy, save_policy
 from mpfa_envs import evaluate as evaluate_policy
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.render import film_episode
 from mpfa_envs.robots.model import ROBOTS
 from tests.integration.run.test_full_disk import file_size
 from training import files
 from training.comparison.jobs import Evaluation, Job
-from training.evaluating import drive, on_robot, summary_row
+from training.evaluating import on_robot, summary_row
 from training.records import read_table
 from training.run.assembly import make_learner
 from training.run.evaluations import exported_policy
 from training.settings.train import GROUPS, TrainSettings
-from training.worlds import is_of_a_test, parse_worlds, worlds_label
+from training.worlds import parse_worlds, worlds_label
 
 SHIPPED = "td3-paper"
 
@@ -38,17 +36,6 @@ def run(tmp_path: Path) -> Path:
     learner = make_learner(settings.learner, GROUPS["method"]["per"], 24, 2)
     save_policy(exported_policy(learner.policy, settings), tmp_path / "policy.npz")
     return tmp_path
-
-
-@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
-def test_worlds_are_driven_together_as_each_is_alone(run: Path, physics: str) -> None:
-    policy, words = load_policy(run), ["B", "bars:test", "rooms:test"]
-    how: dict[str, Any] = {"episodes": 5, "seed": 0, "physics": physics, "progress": False}
-    for word, together in zip(words, drive(policy, words, **how), strict=True):
-        [alone] = drive(policy, [word], **how)
-        assert together.trails == alone.trails
-        for one, same in zip(together.results, alone.results, strict=True):
-            assert replace(one, plan_s=0, decision_s=0) == replace(same, plan_s=0, decision_s=0)
 
 
 def test_the_script_writes_tables_and_pictures(
@@ -79,9 +66,8 @@ def test_the_script_writes_tables_and_pictures(
     [
         (["astar"], "astar", ["trajectories.png", "episode.gif"]),
         (["dwa", "--memory", "map", "--no-pictures"], "dwa-map", []),
-        (["mpc", "--no-pictures"], "mpc", []),
     ],
-    ids=["astar", "dwa", "mpc"],
+    ids=["astar", "dwa"],
 )
 def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     words: list[str],
@@ -235,15 +221,6 @@ def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> N
         assert 3 * 360 <= picture.size[0] < 4 * 360
 
 
-def test_two_splits_of_a_generator_are_apart_in_the_document(run: Path) -> None:
-    words = ["bars:test", "bars:validation"]
-    how = ["--episodes", "2", "--no-pictures", "--output", str(run / "both")]
-    evaluate.main([str(run), "--worlds", *words, *how])
-    found = json.loads((run / "both" / "evaluation.json").read_text())["generators"]
-    episodes = {name: row["episodes"] for name, row in found.items()}
-    assert episodes == {"bars": 2, "bars:validation": 2}
-
-
 def test_the_table_tells_of_walkers_where_there_are_any(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -284,17 +261,6 @@ def test_a_policy_that_never_drove_without_the_filter_has_it_by_default(
     assert evaluate.output_folder(options).name.endswith("-filter") == expected
 
 
-def test_an_archive_of_barn_that_there_is_not_is_rejected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        evaluate.parse([SHIPPED, "--worlds", f"barn:{tmp_path / 'none.zip'}"])
-    assert "none.zip: is neither a folder nor an archive of BARN" in capsys.readouterr().err
-    words = (["barn"], ["barn:a/BARN_dataset"], ["barn:b/BARN_dataset"], ["barn300-5"])
-    assert len({worlds_label(each) for each in words}) == 4
-    assert all(is_of_a_test(word) for each in words for word in each)
-
-
 def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
     lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0, 0.0)
     row = {"world": "A", "physics": "wheels", **summary_row([lost, lost])}
@@ -316,22 +282,6 @@ def test_pictures_without_room_leave_those_before_and_name_their_folder(
     assert ended.value.code == 1
     assert f"{folder} cannot be written, File too large" in capsys.readouterr().err.splitlines()[-1]
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_the_animation_ends_with_the_episode_that_it_shows(run: Path) -> None:
-    (drive,) = world_tasks("halls:validation", episodes=1)
-    film = film_episode(load_policy(run), drive._replace(max_steps=6), physics="kinematic")
-    assert len(film.frames) == 1 + 6 // 2
-
-
-def test_the_policy_that_comes_with_the_project_reaches_its_goals(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    arguments = ["--worlds", "A", "--episodes", "6", "--physics", "kinematic", "--no-pictures"]
-    summary = evaluate.main([SHIPPED, *arguments])
-    assert summary["success"].iloc[0] == 1.0
-    assert (tmp_path / "runs/evaluation-td3-paper/evaluation-A-kinematic/episodes.csv").exists()
 
 
 def test_a_plan_and_a_goal_radius_shorten_and_lengthen_the_drives(

@@ -51,18 +51,6 @@ def test_a_policy_that_needs_the_filter_is_driven_behind_it(tmp_path: Path) -> N
     assert compared["exported"]["success"] == 1.0
 
 
-def test_drives_of_a_file_say_whether_they_had_the_filter(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "policy.onnx"
-    tasks = ["--world", "B", "--episodes", "1", "--output", str(file)]
-    for words, shown in (([], "behind"), (["--no-filter"], "without")):
-        export.main(["td3-rooms", *tasks, *words])
-        assert f"file   1 tasks in B, {shown} the filter: success" in capsys.readouterr().out
-        [compared] = json.loads(file.with_suffix(".json").read_text())["results"]
-        assert compared["filter"] is (shown == "behind")
-
-
 def test_a_file_for_another_robot_has_its_numbers_and_results_on_the_card(tmp_path: Path) -> None:
     shutil.copy(policy_file("td3-rooms"), tmp_path / "policy.npz")
     how, robot = ["--worlds", "B", "--episodes", "2", "--no-pictures"], ["--robot", "turtlebot4"]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -68,35 +67,6 @@ def test_evaluations_are_at_their_steps_and_rates(tmp_path: Path) -> None:
     rising, falling = (colored(path, color, spread=30) for color in (BLUE, ORANGE))
     assert heights(rising, quarter=0) < 0.4 < 0.6 < heights(rising, quarter=3)
     assert heights(falling, quarter=3) < 0.4 < 0.6 < heights(falling, quarter=0)
-
-
-@pytest.mark.parametrize("runs", [3, 6])
-def test_three_runs_are_lines_and_six_have_a_band(runs: int, tmp_path: Path) -> None:
-    path = tmp_path / "evaluations.png"
-    heights = np.linspace(0.2, 0.8, runs)
-    tables = {
-        str(n): pd.DataFrame({"total_steps": [0, 9], "success": h}) for n, h in enumerate(heights)
-    }
-    plot_evaluations({"one": tables}, path)
-    with Image.open(path) as picture:
-        panel = np.asarray(picture.convert("RGB"))[100:380, 300:500].astype(int)
-    tinted = (panel[..., 2] - panel[..., 0] > 10).any(1)
-    assert (tinted.mean() > 0.3) == (runs == 6)
-
-
-def test_the_eighth_arm_has_the_color_of_the_first_and_another_line(tmp_path: Path) -> None:
-    path = tmp_path / "evaluations.png"
-    steps = [1000, 9000]
-    runs = {
-        str(n): {"0": pd.DataFrame({"total_steps": steps, "success": [n / 14] * 2})}
-        for n in range(8)
-    }
-    plot_evaluations(runs, path)
-    blue = colored(path, BLUE, spread=30)
-    # The first is at the bottom, the eighth in the middle; the legend is left of neither.
-    first, eighth = (blue[rows, 300:500].any(0).mean() for rows in (slice(300, 480), slice(300)))
-    assert first == 1.0
-    assert 0.4 < eighth < 0.9
 
 
 def test_the_picture_of_a_search_has_its_trials_the_best_so_far_and_what_mattered(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from training.comparison.arms import Arm
 from training.comparison.jobs import Job
 from training.evaluating import evaluation_folder
 from training.files import check_folder, full_disk, run_script, short_name
-from training.run.script import train
 from training.settings.train import _one_folder
 
 LONG = "a" * 300
@@ -52,32 +50,6 @@ def test_groups_of_arms_that_begin_alike_are_two_groups(tmp_path: Path) -> None:
     groups = [next(w for w in job.overrides([]) if w.startswith("tracking.group")) for job in jobs]
     assert groups[0] != groups[1]
     assert max(len(group.partition("=")[2]) for group in groups) <= 128
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        [f"run_dir={LONG}"],
-        [f"run_dir={'/'.join(['a' * 200] * 20)}"],
-        [f"resume={LONG}"],
-        [f"settings={LONG}.yaml"],
-        [f"plugin={LONG}.py"],
-        [f"environment.robot={LONG}.yaml"],
-        ["-m", "seed=0,1", f"hydra.sweep.dir={LONG}"],
-        ["-m", "seed=0,1", f"hydra.sweep.subdir={LONG}"],
-        ["--cfg", "job", f"hydra.run.dir={LONG}"],
-    ],
-    ids=lambda words: words[-1][:20],
-)
-def test_name_for_train_that_is_too_long_is_one_line(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        train(words)
-    assert caught.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("train.py: ")
-    assert "bytes" in line or "too long" in line or "must be" in line
 
 
 @pytest.mark.parametrize(
@@ -127,23 +99,6 @@ def test_folder_with_the_longest_name_can_be_made(tmp_path: Path) -> None:
     check_folder(tmp_path / ("a" * 255))
     with pytest.raises(ValueError, match="has 256 bytes: a name may have 255"):
         check_folder(tmp_path / ("é" * 128))
-
-
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
-def test_script_on_a_full_disk_ends_with_one_line_that_names_the_file(
-    number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def main() -> None:
-        raise OSError(number, os.strerror(number), "runs/episodes.csv")
-
-    monkeypatch.setattr("sys.argv", ["examples/evaluate.py"])
-    with pytest.raises(SystemExit) as caught:
-        run_script(main)
-    assert caught.value.code == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        f"evaluate.py: runs/episodes.csv cannot be written, {os.strerror(number)}: "
-    )
 
 
 def test_script_passes_other_errors_on_and_returns_its_status() -> None:

@@ -98,14 +98,6 @@ def test_keys_are_wheel_speeds(robot: str, keys: list[str], action: tuple[float,
     assert play.action_of(keys, ROBOTS[robot]) == pytest.approx(action)
 
 
-def test_without_a_key_a_robot_that_can_stop_stands() -> None:
-    racer = play.Racer(straight_task(), robot="kobuki", physics="kinematic")
-    start = racer.pose
-    for _ in range(5):
-        racer.drive(play.action_of([], racer.env.config.robot))
-    assert racer.pose == start
-
-
 @pytest.mark.parametrize(("words", "name"), [([], "kobuki"), (["--robot", "waffle"], "waffle")])
 def test_both_drive_the_robot_of_the_policy_or_another(
     words: list[str], name: str, monkeypatch: pytest.MonkeyPatch
@@ -114,13 +106,6 @@ def test_both_drive_the_robot_of_the_policy_or_another(
     monkeypatch.setattr(play, "race", lambda policy, *_, **how: driven.append(policy))
     play.main(["td3-rooms", "--worlds", "A", "--races", "1", *words])
     assert [policy.env_arguments["robot"]["name"] for policy in driven] == [name]
-
-
-def test_a_player_may_leave(capsys: pytest.CaptureFixture[str]) -> None:
-    pygame.display.init()
-    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE))
-    assert sum(play.main(["--worlds", "A", "--races", "2", "--speed", "100"]).values()) == 0
-    assert "you 0, policy 0" in capsys.readouterr().out
 
 
 def test_episodes_are_watched_to_their_ends() -> None:

@@ -96,17 +96,6 @@ def test_the_target_of_a_last_step_is_its_reward() -> None:
     assert bool((error[~last] > 10).all())
 
 
-@pytest.mark.slow
-def test_the_critics_learn_what_a_slice_pays() -> None:
-    learner = page.RecurrentTD3(SIZE, forgetful=False)
-    batch = make_slices([1] * 40, [True] * 40)
-    errors = []
-    for _ in range(200):
-        learner.update(batch)
-        errors.append(float(batch["signals", "td_error"].mean()))
-    assert errors[-1] < 0.1 * errors[0]
-
-
 def test_every_robot_of_an_evaluation_remembers_its_own_episode() -> None:
     actor = page.Actor(SIZE, forgetful=False)
     driving = page.Driving(actor)
@@ -121,20 +110,6 @@ def test_every_robot_of_an_evaluation_remembers_its_own_episode() -> None:
     np.testing.assert_allclose(again[0], first[1], rtol=0, atol=1e-7)
     assert abs(again[1] - first[2]).max() > 1e-5
     env.close()
-
-
-def test_the_seed_decides_the_policy_to_the_last_bit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name, value in {"EPISODES": 1, "SLICES": 2, "LENGTH": 6, "WARM_UP": 2}.items():
-        monkeypatch.setattr(page, name, value)
-    one, same, other = (
-        torch.cat([p.detach().flatten() for p in page.main(arguments).parameters()])
-        for arguments in (["--actions", "384", "--seed", seed] for seed in ("3", "3", "4"))
-    )
-    assert torch.equal(one, same)
-    assert not torch.equal(one, other)
-    assert capsys.readouterr().out.count("success in bars:validation") == 3
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,7 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_replay
-from sb3_replay import PriorityReplay, PriorityTD3, make_model
+from sb3_replay import PriorityTD3, make_model
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 ALGORITHMS = ["td3", "ddpg"]
@@ -90,29 +88,10 @@ def favor(model: PriorityTD3) -> float:
     return float(counts[order[-third:]].mean() / counts[order[:third]].mean())
 
 
-def no_update(buffer: PriorityReplay) -> None:
-    buffer.batch = None
-
-
-def update_of_others(buffer: PriorityReplay) -> None:
-    signals = buffer.batch["signals"]
-    buffer.batch["signals"] = signals[torch.randperm(len(signals))]
-    buffer.replay.update_tensordict_priority(buffer.batch)
-    buffer.batch = None
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_larger_td_errors_are_sampled_more_often(algorithm: str) -> None:
     assert favor(model_of(algorithm, "per")) > 1.4
     assert favor(model_of(algorithm, "uniform")) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize("broken", [no_update, update_of_others])
-def test_broken_update_of_priorities_is_seen_in_what_is_sampled(
-    broken: Callable[[PriorityReplay], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(PriorityReplay, "update", broken)
-    assert favor(model_of("td3", "per")) < 1.2
 
 
 def test_several_environments_with_normalized_observations_write_their_transitions() -> None:
@@ -162,9 +141,3 @@ def test_another_method_and_memory_of_one_array_are_rejected() -> None:
         make_model("td3", "Pendulum-v1", "lap")
     with pytest.raises(ValueError, match="optimize_memory_usage must be False, got True"):
         make_model("td3", "Pendulum-v1", "per", optimize_memory_usage=True)
-
-
-def test_seed_decides_the_score() -> None:
-    words = ["ddpg", "--actions", "200", "--seed"]
-    scores = [sb3_replay.main([*words, seed]) for seed in ("1", "1", "2")]
-    assert scores[0] == scores[1] != scores[2]

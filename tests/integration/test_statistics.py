@@ -27,38 +27,12 @@ def test_the_least_p_is_that_of_runs_that_differ_as_much_as_they_can() -> None:
         assert found.p == pytest.approx(found.least)
 
 
-def test_mean_interval_covers_the_mean_of_normal_runs_at_its_level() -> None:
-    rng = np.random.default_rng(0)
-    found = [mean_interval(rng.normal(3.0, 2.0, 10)) for _ in range(2000)]
-    assert np.mean([each.low <= 3.0 <= each.high for each in found]) == pytest.approx(
-        0.95, abs=0.015
-    )
-
-
-def test_difference_interval_covers_the_difference_of_unequal_runs_at_its_level() -> None:
-    rng = np.random.default_rng(0)
-    found = [
-        difference_interval(rng.normal(1.0, 3.0, 5), rng.normal(0.0, 1.0, 20)) for _ in range(500)
-    ]
-    assert np.mean([each.low <= 1.0 <= each.high for each in found]) == pytest.approx(
-        0.95, abs=0.015
-    )
-
-
 def test_difference_interval_is_that_of_scipy() -> None:
     rng = np.random.default_rng(0)
     ours, theirs = rng.normal(1.0, 3.0, 5), rng.normal(0.0, 1.0, 20)
     found = difference_interval(ours, theirs)
     expected = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
     assert (found.low, found.high) == pytest.approx(tuple(expected))
-
-
-def test_difference_interval_of_equal_runs_is_that_of_the_other_side() -> None:
-    other = np.array([94.0, 96.0, 97.5])
-    found, alone = difference_interval(other, np.full(4, 95.5)), mean_interval(other)
-    assert (found.low, found.high) == pytest.approx((alone.low - 95.5, alone.high - 95.5))
-    same = difference_interval(np.full(3, 0.1), np.full(3, 0.1))
-    assert (same.low, same.high) == pytest.approx((0.0, 0.0))
 
 
 def test_intervals_of_one_run_have_no_ends() -> None:
@@ -90,15 +64,6 @@ def test_permutation_p_is_the_share_of_all_deals_that_differ_as_much(
     ]
     expected = np.mean(np.array(gaps) >= gaps[0] - 1e-12)
     assert permutation_p(runs[:ours], runs[ours:]) == pytest.approx(expected)
-
-
-@pytest.mark.slow
-def test_tests_keep_their_level_where_nothing_differs() -> None:
-    rng = np.random.default_rng(1)
-    signs = [sign_p(rng.normal(size=8)) <= 0.05 for _ in range(400)]
-    deals = [permutation_p(rng.normal(size=5), rng.normal(size=5)) <= 0.05 for _ in range(400)]
-    assert 0.02 < np.mean(signs) < 0.08
-    assert 0.02 < np.mean(deals) < 0.08
 
 
 def test_holm_multiplies_by_the_comparisons_that_are_left() -> None:

@@ -14,7 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
+from torchrl.objectives import DDPGLoss, TD3Loss
 from torchrl.trainers import Trainer
 
 from tests.integration.test_torchrl_trainer import assert_learned
@@ -26,7 +26,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
 )
 from torchrl_mpfa.integrations.trainer import PriorityStepper
-from torchrl_mpfa.methods.la3p import LA3PSampler
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*Trainer is an experimental"),
@@ -79,11 +78,6 @@ def test_the_policy_that_collects_has_the_weights_that_were_learned() -> None:
         assert weights.equal(learned[name])
 
 
-def test_two_runs_of_one_seed_are_the_same() -> None:
-    first, second = (tiny("seed=3").replay_buffer.sampler.table.rows for _ in range(2))
-    assert first.nan_to_num(-1).equal(second.nan_to_num(-1))
-
-
 def test_other_classes_fit_the_same_places() -> None:
     trainer = tiny(
         "sampler._target_=torchrl_mpfa.SignalSampler",
@@ -103,23 +97,6 @@ def test_many_robots_in_the_worlds_of_a_generator_are_one_setting_away() -> None
     assert_learned(trainer)
 
 
-def test_torchrls_own_networks_fit_the_loss() -> None:
-    critic = "{_target_: torchrl.modules.ValueOperator, module: ${mlp}, "
-    critic += "in_keys: [observation, action], out_keys: [state_action_value]}"
-    trainer = tiny(
-        "+network@mlp=mlp",
-        "mlp.in_features=26",
-        "mlp.out_features=1",
-        "mlp.num_cells=[16]",
-        f"loss.value_network={critic}",
-    )
-    assert_learned(trainer)
-
-
-def test_storage_of_torchrl_learns_by_all_signals() -> None:
-    assert_learned(tiny("storage._target_=torchrl.data.LazyTensorStorage"))
-
-
 def test_the_configuration_of_the_page_builds_a_buffer() -> None:
     page = (EXAMPLES.parent / "docs" / "torchrl_trainer.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
@@ -128,14 +105,6 @@ def test_the_configuration_of_the_page_builds_a_buffer() -> None:
     buffer = instantiate(compose("page").replay_buffer)
     assert [signal.name for signal in buffer.sampler.signals] == ["reward", "td_error", "novelty"]
     assert buffer.sampler.max_size == 100_000
-
-
-def test_a_method_of_the_page_is_made_by_its_name() -> None:
-    page = (EXAMPLES.parent / "docs" / "methods" / "README.md").read_text(encoding="utf-8")
-    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    replay = instantiate(OmegaConf.create(text).replay)
-    assert type(replay.buffer.sampler) is LA3PSampler
-    assert replay.buffer.storage.max_size == 100_000
 
 
 def parts_of(algorithm: str) -> list[str]:
@@ -181,17 +150,6 @@ def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
     PriorityStepper(trainer.optimization_stepper).register(trainer)
     trainer.train()
     assert type(trainer.loss_module) is TD3Loss
-    assert_learned(trainer)
-
-
-def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
-    more = ["collector.policy=${actor}", "+loss.actor_network=${actor}"]
-    more += ["+loss.qvalue_network=${critic}", "+loss.alpha_init=0.2", "trainer.log_rewards=false"]
-    trainer = instantiate(compose(overrides=parts_of("sac") + more).trainer)
-    PriorityStepper().register(trainer)
-    trainer.train()
-    assert type(trainer.loss_module) is SACLoss
-    assert float(trainer.loss_module.alpha_init) == pytest.approx(0.2)
     assert_learned(trainer)
 
 

@@ -21,13 +21,3 @@ def test_every_signal_of_what_was_replayed_is_known(
     assert replayed.sum() > 100
     assert buffer.stats()["stale_updates"] == 0
     assert capsys.readouterr().out.count("weight of ") == 3
-
-
-def test_the_seed_decides_the_signals_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torchrl_ddpg, "BATCH_SIZE", 32)
-    first, second, other = (
-        torchrl_ddpg.main(["--actions", "128", "--seed", seed]).sampler.table.rows.nan_to_num(-1)
-        for seed in ("0", "0", "1")
-    )
-    assert torch.equal(first, second)
-    assert not torch.equal(first, other)

@@ -9,11 +9,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from torchrl.envs import ExplorationType, set_exploration_type
 
 import report
 import torchrl_sac
-from mpfa_envs import load_policy, make_navigation_env
+from mpfa_envs import load_policy
 from training.evaluating import drive
 
 pytestmark = [
@@ -105,14 +104,3 @@ def test_an_update_moves_targets_and_priorities_and_an_evaluation_has_no_noise()
     assert all(each.grad is None for each in run.loss.parameters())
     assert run.buffer.stats()["share/td_error"] > 0
     assert run.evaluate(1) == run.evaluate(1)
-
-
-def test_the_policy_acts_as_the_actor_does() -> None:
-    env = make_navigation_env(num_envs=3, seed=0, **torchrl_sac.SENSES)
-    network, actor, _ = torchrl_sac.make_networks(env)
-    state = env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        want = actor(state)["action"]
-    found = torchrl_sac.policy_of(network, card={})(state["observation"].numpy())
-    torch.testing.assert_close(torch.as_tensor(found, dtype=torch.float32), want)
-    env.close()

@@ -93,19 +93,6 @@ def test_without_a_stepper_the_trainers_own_hook_asks_for_the_signals() -> None:
         trainer.train()
 
 
-def test_two_trainings_of_one_seed_are_the_same_and_of_another_seed_are_not() -> None:
-    tables, policies = [], []
-    for seed in (0, 0, 1):
-        trainer = tiny_trainer(seed)
-        PriorityStepper().register(trainer)
-        trainer.train()
-        tables.append(trainer.replay_buffer.sampler.table.rows.nan_to_num(-1))
-        policies.append(torch.cat([p.flatten() for p in trainer.loss_module.parameters()]))
-    assert tables[0].equal(tables[1])
-    assert policies[0].equal(policies[1])
-    assert not tables[0].equal(tables[2])
-
-
 def test_the_trap_is_there_a_silent_stepper_leaves_all_priorities_as_they_were() -> None:
     trainer = tiny_trainer()
     trainer.optimization_stepper = DefaultOptimizationStepper()

@@ -161,48 +161,6 @@ def test_policies_are_evaluated_behind_the_filter_that_they_need_unless_asked_ot
     assert not job.is_evaluated(replace(wanted, filtered=not needs if asked is None else True))
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("in_this_process")
-def test_a_comparison_is_evaluated_again_on_wheels_and_filtered_and_trains_nothing_for_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    plain = comparison(tmp_path, methods=("per",))
-    on_wheels = comparison(tmp_path, "--physics", "wheels", methods=("per",))
-    assert compare.main(plain) == 0
-    as_trained = read_table(tmp_path / files.EPISODES)
-    checkpoint = tmp_path / "ddpg-per-0" / files.CHECKPOINT
-    before = checkpoint.stat().st_mtime_ns
-    assert compare.main(on_wheels) == 0
-    found = read_table(tmp_path / files.EPISODES)
-    assert set(found["physics"]) == {"wheels"}
-    assert not found["path_length"].equals(as_trained["path_length"])
-    assert json.loads((tmp_path / files.SETTINGS).read_text())["physics"] == "wheels"
-    assert checkpoint.stat().st_mtime_ns == before
-    filtered = comparison(tmp_path, "--physics", "wheels", "--filter", methods=("per",))
-    assert compare.main(filtered) == 0
-    assert not read_table(tmp_path / files.EPISODES)["path_length"].equals(found["path_length"])
-    assert json.loads((tmp_path / files.SETTINGS).read_text())["filter"] is True
-    assert checkpoint.stat().st_mtime_ns == before
-    # All stay where they are: each can be asked for again.
-    capsys.readouterr()
-    for arguments in (plain, on_wheels, filtered):
-        assert compare.main(arguments) == 0
-        assert "1 runs, 1 of them done" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("in_this_process")
-def test_a_run_that_ends_in_the_middle_of_an_episode_is_evaluated_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = comparison(tmp_path, "--seeds", "0", "1", methods=("per",))
-    arguments[-1] = "curriculum.stages=[{world: A, actions: 30}]"
-    assert compare.main(arguments) == 0
-    assert list(read_table(tmp_path / files.EPISODES)["seed"]) == [0] * 6 + [1] * 6
-    assert compare.main(arguments) == 0
-    assert "2 runs, 2 of them done" in capsys.readouterr().out
-
-
 @pytest.mark.usefixtures("in_this_process")
 def test_arms_are_trained_with_settings_of_their_own_and_told_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -324,32 +282,6 @@ def test_a_run_whose_worker_is_gone_goes_on_at_its_last_checkpoint(
     monkeypatch.setattr(execution, "LocalWorker", OnWorkersThatFail)
     assert compare.main(comparison(tmp_path / "never", methods=("per",))) == 1
     assert "ddpg-per-0: failed, lost 2 workers" in capsys.readouterr().out
-
-
-def test_training_again_that_is_lost_goes_on_with_the_new_settings(
-    tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = [*comparison(tmp_path, "--anew", methods=("per",)), "method.alpha=0.9"]
-    assert compare.main(comparison(tmp_path, methods=("per",))) == 0
-    losses = [True]
-
-    class Gone(InThisProcess):
-        """Is gone before it has begun."""
-
-        def start(self, command: Sequence[str], log: Path) -> None:
-            if not losses:
-                super().start(command, log)
-
-        def ended(self) -> int:
-            if losses:
-                losses.clear()
-                raise Lost("worker 7 is gone")
-            return super().ended()
-
-    monkeypatch.setattr(execution, "LocalWorker", Gone)
-    assert compare.main(arguments) == 0
-    kept = json.loads((tmp_path / "ddpg-per-0" / files.SETTINGS).read_text())
-    assert kept["method"]["alpha"] == 0.9
 
 
 def test_a_comparison_says_what_it_needs_where_there_is_no_ray(

@@ -43,23 +43,6 @@ def tables_of(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> s
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_random_worlds_and_other_physics_have_tables_of_their_own(comparison: Path) -> None:
-    def in_rooms_too(rows: pd.DataFrame) -> pd.DataFrame:
-        return pd.concat([rows, rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))])
-
-    test, random = tables_of(comparison, in_rooms_too).split("## rooms")
-    assert LINE in test and LINE in random
-
-    def on_wheels_too(rows: pd.DataFrame) -> pd.DataFrame:
-        rows = rows.query("world == 'test'")
-        return pd.concat([rows.assign(physics=each) for each in ("wheels", "kinematic")])
-
-    text = tables_of(comparison, on_wheels_too)
-    assert text.index("## test, wheels") < text.index("## test, kinematic")
-    assert text.count(LINE) == 2
-
-
-@pytest.mark.usefixtures("tables_alone")
 def test_the_arms_of_a_comparison_have_rows_of_their_own(comparison: Path) -> None:
     for seed in (0, 1):
         (comparison / f"ddpg-per-{seed}").rename(comparison / f"ddpg-per-None-{seed}")
@@ -128,11 +111,6 @@ def test_two_comparisons_of_one_name_have_the_runs_of_both(
     }
 
 
-def test_the_figures_may_go_elsewhere(comparison: Path, tmp_path: Path) -> None:
-    assert report.main([str(comparison), "--output", str(tmp_path / "images")]) == 0
-    assert (tmp_path / "images" / "evaluations.png").exists()
-
-
 @pytest.mark.usefixtures("tables_alone")
 def test_runs_on_other_pairs_are_not_compared(
     comparison: Path, capsys: pytest.CaptureFixture[str]
@@ -165,12 +143,3 @@ def test_a_row_of_a_comparison_that_cannot_be_used_is_rejected(
     with pytest.raises(SystemExit):
         report.main([str(comparison)])
     assert error in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("tables_alone")
-def test_truth_values_in_words_count_as_they_do_in_numbers(comparison: Path) -> None:
-    words = {"True": "true", "False": "false", "1": "TRUE", "0": "FALSE", "1.0": "1", "0.0": "0"}
-    changed = tables_of(
-        comparison, lambda rows: rows.assign(success=rows["success"].astype(str).map(words))
-    )
-    assert LINE in changed

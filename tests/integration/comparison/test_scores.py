@@ -91,7 +91,6 @@ def test_each_task_has_tables_of_its_own(tmp_path: Path) -> None:
             "task,method,seed,steps,score\n",
             "neither episodes.csv of compare.py nor rows of task, method",
         ),
-        ("task,method,seed,steps,score\nR,sac,0,1,2\nR,sac,0,2,many\n", ":3: score must be a fin"),
         ("task,method,seed,steps,score\nR,sac,0,1,2\nR,sac,0,1,3\n", "got two of task R, method"),
         (
             "task,method,seed,steps,score\nR,sac,0,1,2\nR,per,0,5,3\n",
@@ -131,15 +130,10 @@ def written(folder: Path, text: str, encoding: str = "utf-8") -> int:
     ("row", "error"),
     [
         ("t,new,,0,1", "3: seed must not be empty"),
-        ("t,,0,0,1", "3: method must not be empty"),
-        (",new,0,0,1", "3: task must not be empty"),
         ("t,  ,0,0,1", "3: method must not be empty"),
         ("t,new,0,0,", "3: score must be a finite number, got an empty cell"),
-        ("t,new,0,0,nan", "3: score must be a finite number, got 'nan'"),
-        ("t,new,0,0,-inf", "3: score must be a finite number, got '-inf'"),
         ("t,new,0,0,good", "3: score must be a finite number, got 'good'"),
         ("t,new,0,1 000,1", "3: steps must be a finite number, got '1 000'"),
-        ("t,new,0,0", "3: score must be a finite number, got an empty cell"),
         ("t,old,0.0,0,1", "3: a run must have one score at each step, got two of task t"),
         ("\n\nt,new,,0,1", "5: seed must not be empty"),
         ("t,new,0,0,1,9,9\n1,2,3,4,5,6,7,8", "its rows cannot be read"),
@@ -153,15 +147,6 @@ def test_a_row_that_cannot_be_used_is_rejected_by_its_line(
     assert f"scores.csv:{error}" in (said := capsys.readouterr().err) or error in said
 
 
-@pytest.mark.parametrize("text", ["", "\n", "task,method\n", "task,method,seed,steps,score\n"])
-def test_a_table_without_rows_is_rejected_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
-) -> None:
-    with pytest.raises(SystemExit):
-        written(tmp_path, text)
-    assert "scores.csv" in capsys.readouterr().err.splitlines()[-1]
-
-
 ROWS = "task,method,seed,steps,score\nt,old,0,0,1\nt,old,0,10,2\n"
 
 
@@ -171,9 +156,7 @@ ROWS = "task,method,seed,steps,score\nt,old,0,0,1\nt,old,0,10,2\n"
         (ROWS, "utf-8-sig"),
         (ROWS.replace(",", ";"), "utf-8"),
         (ROWS.replace(",", "\t"), "utf-8"),
-        (ROWS.replace(",", ", "), "utf-8"),
         (ROWS.replace("\n", "\r\n"), "utf-8"),
-        (ROWS.replace("\n", "\n\n"), "utf-8"),
         (ROWS.replace("old,0,", "old,0.00,"), "utf-8"),
         ("x,task,method,seed,steps,score\n9,t,old,0,0,1\n9,t,old,0,10,2\n", "utf-8"),
     ],

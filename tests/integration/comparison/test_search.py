@@ -24,11 +24,10 @@ from optuna.exceptions import StorageInternalError
 import tune
 from tests.integration.comparison.test_compare import InThisProcess, alive, descendants
 from tests.integration.tiny_runs import OVERRIDES
-from training import figures, files
+from training import files
 from training.comparison import execution
 from training.comparison.arms import parse_arm
 from training.comparison.jobs import Job
-from training.comparison.workers import Lost
 from training.records import read_table, write_table
 from training.settings.command_line import composed
 
@@ -299,28 +298,6 @@ def test_a_study_on_a_full_disk_ends_in_one_line_and_goes_on_as_if_never_stopped
     assert trials_of(tmp_path / "study").equals(trials_of(tmp_path / "whole"))
 
 
-def test_a_trial_whose_worker_is_gone_goes_on(
-    tmp_path: Path, ranges: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Gone(Pretends):
-        left = 7
-
-        def ended(self) -> int | None:
-            Gone.left -= 1
-            if not Gone.left:
-                raise Lost("worker 7 is gone")
-            return super().ended()
-
-    monkeypatch.setattr(execution, "LocalWorker", Gone)
-    assert tune.main(command(tmp_path / "lost", ranges, trials=3)) == 0
-    assert [path.parent.name for path in Pretends.begun] == [
-        *("trial-0000", "trial-0001", "trial-0001", "trial-0002")
-    ]
-    monkeypatch.setattr(execution, "LocalWorker", Pretends)
-    assert tune.main(command(tmp_path / "whole", ranges, trials=3)) == 0
-    assert trials_of(tmp_path / "lost").equals(trials_of(tmp_path / "whole"))
-
-
 def test_another_search_in_the_same_folder_is_rejected_by_what_is_other(
     tmp_path: Path, ranges: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -355,23 +332,6 @@ def tiny(folder: Path) -> list[str]:
 def settled(arguments: list[str]) -> list[str]:
     """The same without the setting that stands there twice."""
     return [word for word in arguments if word != "evaluation.every=0"]
-
-
-@pytest.mark.slow
-def test_a_tiny_search_trains_with_the_settings_of_its_trials(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
-    monkeypatch.setattr(figures, "plot_learning_curve", lambda *_: None)
-    assert tune.main(settled(tiny(tmp_path / "tune"))) == 0
-    rates = written(tmp_path / "tune", "learner.actor_lr")
-    assert len(rates) == 3
-    for number, rate in enumerate(rates):
-        run = tmp_path / f"tune/trial-{number:04}/ddpg-mpfa_per-3000"
-        kept = json.loads((run / files.SETTINGS).read_text())
-        assert kept["learner"]["actor_lr"] == rate
-        assert kept["learner"]["width"] == 8
-        assert list(read_table(run / files.EVALUATIONS)["total_steps"]) == [30, 60]
 
 
 @pytest.mark.slow

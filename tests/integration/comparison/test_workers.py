@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -13,16 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import compare
 from tests.integration.comparison.test_compare import (
     EPISODES,
-    InThisProcess,
-    assert_same_rows,
-    comparison,
 )
 from tests.integration.tiny_runs import OVERRIDES
 from training import files
-from training.comparison import execution
 from training.comparison.jobs import SCRIPTS, Evaluation, Job
 from training.comparison.workers import LocalWorker, Lost
 from training.records import read_table
@@ -147,34 +140,3 @@ def test_a_script_whose_output_has_no_room_says_so_and_its_worker_stays(
         end_of(worker)
     worker.start(help_text, Path("/dev/null"))
     assert end_of(worker) == 0
-
-
-@pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
-@pytest.mark.slow
-def test_a_comparison_whose_worker_is_killed_gives_the_rows_of_one_that_is_not(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    killed: list[int] = []
-
-    class Killed(LocalWorker):
-        """Is killed when its first run has a checkpoint."""
-
-        def ended(self) -> int | None:
-            checkpoint = tmp_path / "killed" / "ddpg-mpfa_per-0" / files.CHECKPOINT
-            assert self._process is not None and self._process.pid is not None
-            if not killed and checkpoint.exists():
-                killed.append(self._process.pid)
-                os.kill(self._process.pid, signal.SIGKILL)
-                self._process.join()
-            return super().ended()
-
-    arguments = comparison(tmp_path / "killed", "--jobs", "1", length=60)
-    arguments.append("checkpoint_every=20")
-    monkeypatch.setattr(execution, "LocalWorker", Killed)
-    assert compare.main(arguments) == 0
-    assert capsys.readouterr().out.count("its worker is gone, resumes at its last") == 1
-    assert not list((tmp_path / "killed").glob(f"*/{files.PREVIOUS}"))
-    arguments[1] = str(tmp_path / "whole")
-    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
-    assert compare.main(arguments) == 0
-    assert_same_rows(tmp_path / "killed", tmp_path / "whole")

@@ -53,12 +53,6 @@ def test_only_the_robots_that_begin_an_episode_get_another_share() -> None:
     assert (explorer.shares == before).squeeze().tolist() == [True, False, True]
 
 
-def test_without_varying_the_noise_is_the_same_in_all_episodes() -> None:
-    explorer = NoisyPolicy(make_actor(5, 2), ExplorationSettings(varied=False), SPEC)
-    explorer.begin_episodes(ALL)
-    assert explorer.shares.tolist() == [[1.0]] * 3
-
-
 def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:
     explorer = make_explorer(make_stochastic_actor(5, 2), ExplorationSettings(), SPEC)
     assert isinstance(explorer, RandomPolicy)
@@ -66,10 +60,6 @@ def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:
         actions = torch.stack([explorer.act(OBSERVATION) for _ in range(50)])
     assert actions.std(0).min() > 0.05
     assert actions.abs().max() <= 1.0
-
-
-def test_a_deterministic_policy_gets_noise() -> None:
-    assert isinstance(make_explorer(make_actor(5, 2), ExplorationSettings(), SPEC), NoisyPolicy)
 
 
 def test_a_choice_at_random_becomes_as_rare_as_it_is_told_and_each_robot_has_its_share() -> None:

@@ -12,15 +12,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from torchrl.record.loggers.csv import CSVExperiment
 
 from tests.integration.tiny_runs import OVERRIDES
-from training import figures, files
-from training.pictures import write_pictures
-from training.run import showing
+from training import files
 from training.run.checkpoints import save
 from training.run.hooks import Hook
 from training.run.loggers import forget_after
@@ -126,33 +123,6 @@ def test_thread_that_writes_a_log_reports_a_full_disk_in_the_one_line_of_the_run
     assert begun(tmp_path, "tracking=[tensorboard]", *CSV[1:], most=500) == 1
     (line,) = printed()
     assert line.startswith(f"train.py: {tmp_path}")
-
-
-def test_pictures_without_room_end_a_run_before_it_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Callable[[], list[str]]
-) -> None:
-    def write(*arguments: Any, **options: Any) -> None:
-        write_pictures(*arguments, **options)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1500, resource.RLIM_INFINITY))
-
-    monkeypatch.setattr(showing, "write_pictures", write)
-    words = ("tracking=[tensorboard]", "tracking.pictures_every=0", "evaluation.episodes=2")
-    assert begun(tmp_path, *words, *CSV[1:]) == 1
-    assert len(printed()) == 1
-    assert '"finished": false' in (tmp_path / files.STATUS).read_text()
-
-
-def test_a_disk_without_room_for_charts_ends_a_run_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "no space left", str(tmp_path / files.CURVE))
-
-    monkeypatch.setattr(figures, "plot_learning_curve", full)
-    assert begun(tmp_path, *CSV[2:]) == 1
-    printed = capsys.readouterr()
-    assert printed.err.splitlines()[-1].startswith(f"train.py: {tmp_path / files.CURVE} cannot be")
-    assert f"continue with: train.py resume={tmp_path}" in printed.out
 
 
 def test_run_whose_disk_is_full_says_so_in_one_line_and_how_to_resume(

@@ -112,13 +112,6 @@ def test_loaded_history_continues():
         ReplayHistory(bins=3).load_state_dict({"priority": history.state_dict()["priority"]})
 
 
-def test_steps_and_bins_of_numpy_are_kept_as_plain_numbers():
-    history = ReplayHistory(bins=np.int64(3))
-    history.add(np.int64(7), filled(MPFASampler(200)))
-    (kind,) = {type(step) for entry in history.state_dict().values() for step in entry["steps"]}
-    assert kind is int
-
-
 @pytest.mark.parametrize("wrong", [-1, 1.5, True, "3"])
 def test_step_of_a_history_that_is_no_count_is_rejected_and_adds_nothing(wrong):
     history = ReplayHistory()

@@ -97,13 +97,6 @@ def test_a_hook_is_called_in_the_order_of_a_run_after_the_run_s_own(tmp_path: Pa
     assert places == sorted(places)
 
 
-def test_a_hook_that_looks_changes_nothing(tmp_path: Path) -> None:
-    looked = TrainingRun(of_all_events(), tmp_path, hooks=[Noted()])
-    looked.train()
-    looked.close()
-    assert_same_run(looked, train(tmp_path / "plain", of_all_events()))
-
-
 @pytest.mark.parametrize(
     "event",
     mostly_slow(["on_update", "on_episode", "on_evaluation", "on_iteration"], ["on_iteration"]),

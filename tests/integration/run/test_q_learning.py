@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import copy
 
-import numpy as np
 import pytest
 import torch
 
 from tests.mpfa.learners.test_dqn import ACTIONS, GAMMA, SIZE, transitions
-from torchrl_mpfa import Learner, make_value_network, run_updates
-from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa import Learner, make_value_network
 from torchrl_mpfa.selection import SampledBatch
 from training.run.q_learning import TabularQLearner, make_value_table
 
@@ -96,57 +94,6 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing():
     )
 
 
-def test_ends_that_are_bytes_count_as_booleans():
-    batch, numbers = transitions(), transitions()
-    for key in ("done", "terminated"):
-        numbers["next", key] = numbers["next", key].to(torch.uint8)
-    for each in (batch, numbers):
-        make_table().update(each)
-    assert torch.equal(batch["signals", "td_error"], numbers["signals", "td_error"])
-
-
-@pytest.mark.parametrize("form", ["booleans", "floats", "column", "numbers", "column of floats"])
-def test_every_form_of_an_action_is_learned_from_alike(form):
-    batch, other = transitions(), transitions()
-    hot = batch["action"]
-    number = hot.argmax(-1)
-    other["action"] = {
-        "booleans": hot.bool(),
-        "floats": hot.float(),
-        "column": number.unsqueeze(1),
-        "numbers": number,
-        "column of floats": number.float().unsqueeze(1),
-    }[form]
-    for each in (batch, other):
-        make_table().update(each)
-    assert torch.equal(batch["signals", "td_error"], other["signals", "td_error"])
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda hot: hot / ACTIONS,
-        lambda hot: hot * 2,
-        lambda hot: hot * 0,
-        lambda hot: hot + hot.roll(1, -1),
-        lambda hot: hot[:, 1:],
-        lambda hot: torch.nn.functional.pad(hot, (0, 1)),
-        lambda hot: hot.argmax(-1) + ACTIONS,
-        lambda hot: hot.argmax(-1).neg() - 1,
-        lambda hot: hot.argmax(-1) + 0.5,
-        lambda hot: hot[:, :1].bool(),
-    ],
-)
-def test_bad_action_is_rejected_by_name_and_changes_nothing(spoil):
-    learner = make_table()
-    before, batch = copy.deepcopy(learner.state_dict()["networks"]), transitions()
-    batch["action"] = spoil(batch["action"])
-    with pytest.raises(ValueError, match=f"action must be one-hot among {ACTIONS}"):
-        learner.update(batch)
-    after = learner.state_dict()["networks"]
-    assert all(torch.equal(before[key], after[key]) for key in before)
-
-
 def test_transitions_of_several_steps_are_discounted_by_all_of_them():
     learner = make_table()
     learner.update(transitions(seed=5))  # Values that are not zero.
@@ -168,24 +115,6 @@ def test_transitions_of_several_steps_are_discounted_by_all_of_them():
     assert batch["signals", "td_error"].tolist() == pytest.approx(expected, abs=1e-4)
 
 
-def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals():
-    replay = make_replay(
-        "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
-        generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
-    rows = transitions(200)
-    rows["next", "reward"] = rows["action"][:, 2:3].float()
-    rows["next", "terminated"][:] = True
-    replay.buffer.extend(rows.exclude("priority_weight"))
-    learner = make_table()
-    for _ in range(60):
-        run_updates(replay.buffer, learner, replay.select, updates=4)
-    found = learner.policy.outputs({"observation": torch.rand(50, SIZE)})
-    assert (found["action"].argmax(-1) == 2).all()
-    assert (found["action"].sum(-1) == 1).all()
-    assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
-
-
 def test_rate_of_a_table_follows_annealing():
     learner = TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
     row = transitions(1).exclude("priority_weight")
@@ -204,8 +133,3 @@ def test_argument_out_of_range_is_rejected_by_name():
             make_value_table(**{"cell_of": len, "cells": 3, "actions": 2, name: 0})
     with pytest.raises(TypeError, match="policy must be one of make_value_table"):
         TabularQLearner(make_value_network(4, 5))
-
-
-def test_rate_of_numpy_is_kept_as_a_plain_number():
-    learner = make_table(lr=np.float32(0.5), gamma=np.float32(0.5))
-    assert [type(number) for number in (learner._rate, learner.gamma)] == [float, float]

@@ -14,12 +14,9 @@ import wandb
 import yaml
 
 import evaluate
-from mpfa_envs.evaluation.runs import Filtered
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
-from training.finished import is_finished
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run import showing
 from training.run.checkpoints import save
 from training.run.loop import TrainingRun
 from training.run.showing import show_policy
@@ -207,15 +204,6 @@ def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: K
     assert run.tracker.upload is not None and run.tracker.upload.endswith(run.tracker.run_id)
 
 
-def test_a_row_that_was_cut_short_is_removed_from_a_csv_file(tmp_path: Path) -> None:
-    from training.run.loggers import forget_after
-
-    path = tmp_path / "success.csv"
-    path.write_text("10,1.0\n20,0.0\n30,1.0\n20")
-    forget_after(20, path)
-    assert path.read_text() == "10,1.0\n20,0.0\n"
-
-
 def test_a_run_that_is_begun_anew_begins_new_logs(tmp_path: Path) -> None:
     for log in (files.CSV, files.TENSORBOARD):
         (tmp_path / log).mkdir()
@@ -295,22 +283,6 @@ def test_what_evaluate_py_finds_is_in_the_wandb_run_of_the_training(
     assert len(kept.rows) == before + 1 and not (tmp_path / "wandb").exists()
 
 
-def test_pictures_of_a_policy_that_needs_the_filter_are_made_behind_it(
-    tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drivers: list[object] = []
-    drive = showing.drive
-    monkeypatch.setattr(
-        showing, "drive", lambda driver, *a, **k: drivers.append(driver) or drive(driver, *a, **k)
-    )
-    settings = tiny(episodes=[Stage("A", 1)])
-    settings.tracking = replace(OFFLINE)
-    settings.evaluation = replace(settings.evaluation, world="A", episodes=1)
-    settings.environment = replace(settings.environment, robot="kobuki", filter=1.0)
-    train(tmp_path, settings)
-    assert [type(driver) for driver in drivers] == [Filtered]
-
-
 @pytest.mark.parametrize(
     ("places", "shows"),
     [({}, False), ({"csv": True}, False), ({"csv": True, "tensorboard": True}, True)],
@@ -337,27 +309,6 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     train(tmp_path / "run", settings)
     (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
     assert shown == [*(range(20, end, 20) if every else ()), end]
-
-
-def test_pictures_that_were_interrupted_are_made_when_the_run_resumes(
-    tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(run: TrainingRun) -> None:
-        raise KeyboardInterrupt
-
-    settings = tiny(episodes=[Stage("A", 1)])
-    settings.tracking = replace(OFFLINE)
-    settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
-    with monkeypatch.context() as patch:
-        patch.setattr("training.run.showing.show_policy", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            train(tmp_path, settings)
-    assert not is_finished(tmp_path)
-    assert not any("policy/paths" in row for row in kept.rows.values())
-    go_on(tmp_path, settings)
-    assert is_finished(tmp_path)
-    assert sum("policy/paths" in row for row in kept.rows.values()) == 1
-    assert len(kept.artifacts) == 1
 
 
 def test_a_run_of_wandb_s_sweep_is_what_its_file_says(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,8 +31,8 @@ from torchrl_mpfa.saving import save_atomically
 from training.evaluating import Drives
 from training.files import CHECKPOINT
 from training.records import EvaluationRecord
-from training.run import checkpoints, loop
-from training.run.checkpoints import random_state, read_checkpoint, save, set_random_state
+from training.run import loop
+from training.run.checkpoints import random_state, read_checkpoint, set_random_state
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.train import GROUPS, Stage, TrainSettings
@@ -225,26 +225,6 @@ def test_the_random_numbers_of_a_gpu_are_kept_with_those_of_the_cpu(
     assert on_gpu["cuda:1"].item() == 7
 
 
-def test_a_checkpoint_has_the_random_numbers_of_the_device_that_it_runs_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = TrainingRun(tiny(), tmp_path)
-    asked: list[str] = []
-    monkeypatch.setattr(checkpoints, "random_state", lambda device: asked.append(device))
-    run.settings.device = "cuda:0"
-    save(run)
-    run.close()
-    assert asked == ["cuda:0"]
-
-
-def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
-    run = train(tmp_path, tiny())
-    assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
-    assert all(r.success + r.collision + r.timeout == 1 for r in run.records)
-    assert sum(r.steps for r in run.records) == run.actions == run.records[-1].total_steps
-    assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
-
-
 @pytest.mark.parametrize("learner", sorted({*GROUPS["learner"]} - {"dqn", "q_learning"}))
 def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str) -> None:
     run = train(tmp_path, tiny(learner=learner))
@@ -266,25 +246,6 @@ def test_a_checkpoint_of_another_version_or_a_damaged_one_is_rejected(tmp_path: 
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match="resume"):
         read_checkpoint(tmp_path / "elsewhere")
-
-
-def test_an_update_that_raises_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
-    failing = TrainingRun(tiny(), tmp_path)
-    update, count = failing.learner.update, 0
-
-    def fail(draw: object) -> dict[str, torch.Tensor]:
-        nonlocal count
-        count += 1
-        if count == 15:
-            raise ValueError("the loss is not finite")
-        return update(draw)
-
-    failing.learner.update = fail
-    with pytest.raises(ValueError, match="not finite"):
-        failing.train()
-    failing.close()
-    assert read_checkpoint(tmp_path)["schedule"]["actions"] == failing.actions
-    go_on(tmp_path, tiny())
 
 
 def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:

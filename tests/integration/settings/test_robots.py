@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -36,18 +35,6 @@ def test_settings_hold_the_values_of_the_file(tmp_path: Path) -> None:
     write_settings(settings, tmp_path / "settings.json")
     for saved in (asdict(settings), json.loads((tmp_path / "settings.json").read_text())):
         assert as_settings(saved).environment == settings.environment
-
-
-def test_settings_do_not_need_the_files_of_a_controller(tmp_path: Path) -> None:
-    file, controller = tmp_path / "cart.yaml", tmp_path / "nav2.yaml"
-    text = EXAMPLE_ROBOT.read_text(encoding="utf-8")
-    file.write_text(re.sub("turn_limit:.*", "controller: nav2.yaml", text), encoding="utf-8")
-    controller.write_text("FollowPath: {max_vel_theta: 1.5}\n", encoding="utf-8")
-    saved = asdict(asked(file))
-    file.unlink()
-    controller.unlink()
-    robot = as_settings(saved).environment.robot
-    assert resolve_robot(robot) == replace(CART, turn_limit=1.5)
 
 
 def test_saved_noise_with_a_latency_is_rejected_unless_it_is_none(tmp_path: Path) -> None:
