@@ -27,12 +27,6 @@ def test_boost_of_hand_numbers_under_each_bound(bound, expected):
     assert found.tolist() == pytest.approx(expected)
 
 
-def test_only_transitions_of_positive_reward_are_boosted():
-    priority = torch.tensor([2.0, 2.0, 2.0])
-    assert PositiveBoost()(priority, facts([1.0, 0.0, -1.0])).tolist() == [6.0, 2.0, 2.0]
-    assert priority.tolist() == [2.0, 2.0, 2.0], "the input must not be changed"
-
-
 def test_boost_equals_the_oracle():
     priority = torch.rand(64, generator=seeded())
     rewards = torch.randn(64, generator=seeded(1))

@@ -97,8 +97,6 @@ def misspelt(name):
 ROWS = [
     (tree_sampler, {"max_capacity": 0}, f"max_capacity {NO_COUNT} 0"),
     (tree_sampler, {"alpha": -1.0}, "alpha must be greater or equal to 0 and finite, got -1.0"),
-    (tree_sampler, {"beta": NAN}, f"beta {NEGATIVE}, got nan"),
-    (tree_sampler, {"eps": INF}, f"eps {NEGATIVE}, got inf"),
     (tree_sampler, {"dtype": torch.long}, "dtype must be torch.float32 or .*, got torch.int64"),
     (slice_sampler, {"slice_len": 2.0}, f"slice_len {NO_COUNT} 2.0"),
     (slice_sampler, {"slice_len": 9}, "slice_len must be at most max_capacity, 8, got 9"),
@@ -113,13 +111,11 @@ ROWS = [
         (mpfa_sampler, {"positive_above": level}, "positive_above must be a finite number or 'm")
         for level in ("median", None, NAN, True)
     ],
-    (mpfa_sampler, {"max_capacity": 10**30}, f"max_capacity {NO_COUNT} 1000"),
     (mpfa_sampler, {"entropy_refresh": -1.0}, f"entropy_refresh {NEGATIVE}, got -1.0"),
     (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
     (mpfa_sampler, {"fusion": object()}, "fusion must be a torchrl_mpfa.Fusion, got object$"),
     (mpfa_sampler, {"fusion": EntropyFusion}, "Fusion, got the class EntropyFusion$"),
     (mpfa_sampler, {"adjustments": [len]}, "list of .*Adjustment, got builtin_function_or_method$"),
-    (mpfa_sampler, {"adjustments": [3]}, "adjustments must be a list of .*Adjustment, got int$"),
     (
         mpfa_sampler,
         {"adjustments": PositiveBoost()},
@@ -148,20 +144,15 @@ ROWS = [
     ),
     (Signal, {"name": "a", "priority": "abs"}, "priority must be a function, got 'abs'"),
     (as_signals, {"signals": "novelty"}, "must be a list of signals or their names, got 'novelty'"),
-    (as_signals, {"signals": [1]}, r"signals must be a list of signals or their names, got \[1\]"),
     (EntropyFusion, {"population": "world"}, "population must be .*got 'world'"),
     (EntropyFusion, {"floor": 1.0}, r"floor must be in \[0, 1\), got 1.0"),
-    (EntropyFusion, {"floor": [0.1]}, rf"floor {NO_NUMBER} \[0.1\]"),
-    (EntropyFusion, {"reward_signals": 5}, "reward_signals must be names, got 5"),
     (EntropyFusion, {"reward_signals": "reward"}, "reward_signals must be names, got 'reward'"),
     (weight, {"value": -1.0}, f"weight of 'td_error' {NEGATIVE}, got -1.0"),
-    (weight, {"value": "1"}, f"weight of 'td_error' {NO_NUMBER} '1'"),
     (weight, {"value": 0.0}, "values must have a positive weight"),
     (FixedFusion, {"values": None}, "values must be a weight for each signal, got None"),
     (ScaledFusion, {"fusion": None}, "fusion must be a Fusion, got None"),
     (anneal, {"fraction": 1.1}, r"fraction must be in \[0, 1\], got 1.1"),
     (PositiveBoost, {"boost": 0.0}, f"boost {NOT_POSITIVE} 0.0"),
-    (PositiveDecay, {"sharpness": NAN}, f"sharpness {NOT_POSITIVE} nan"),
     (PositiveBoost, {"bound": "wall"}, "bound must be .*got 'wall'"),
     (PositiveBoost, {"target_share": 1.0}, r"target_share must be in \[0, 1\), got 1.0"),
     (
@@ -170,7 +161,6 @@ ROWS = [
         r"boost must be at least 1 with a target_share, got 0\.5",
     ),
     (PositiveDecay, {"position": "front"}, "position must be .*got 'front'"),
-    (PositiveDecay, {"sharpness": torch.rand(2)}, f"sharpness {NO_NUMBER} tensor"),
     *[
         (entropy, {"reward": torch.empty(0)}, "reward must hold at least one transition")
         for entropy in (reward_entropy, positive_entropy)
@@ -181,7 +171,6 @@ ROWS = [
     ],
     (gradient, {"order": NAN}, "order must be positive, got nan"),
     (actor, {"final_init": "0"}, f"final_init {NO_NUMBER} '0'"),
-    (actor, {"width": 2**31}, f"width {NO_COUNT}"),
     *[(updates, {"count": count}, f"updates {NO_COUNT} {count}") for count in (0, -1, 1.5, True)],
     (sac, {"alpha": NAN}, f"alpha {NOT_POSITIVE} nan"),
 ]

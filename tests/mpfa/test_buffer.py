@@ -17,7 +17,6 @@ from tests.mpfa.transitions import (
     rejected,
     same,
     snapshot,
-    train_rounds,
     write_signals,
 )
 from torchrl_mpfa import (
@@ -81,14 +80,6 @@ def test_a_batch_from_before_the_buffer_was_emptied_is_stale(filled, times):
         buffer.update_tensordict_priority(batch.exclude("written_at"))
 
 
-def test_a_row_that_was_written_in_place_is_stale():
-    buffer = make_filled(2, 2)
-    batch = write_signals(buffer.sample())
-    buffer[torch.arange(2)] = make_transitions(2)
-    buffer.update_tensordict_priority(batch)
-    assert buffer.stale_updates == 2
-
-
 def test_without_the_time_of_writing_every_row_is_taken():
     buffer = make_filled(8)
     batch = write_signals(buffer.sample()).exclude("written_at")
@@ -137,17 +128,6 @@ def test_signals_are_read_under_nested_and_renamed_keys():
     assert leaves(buffer).tolist() == pytest.approx([2.5**0.6, 4.0**0.6])
 
 
-def test_adding_one_by_one_equals_extending_at_once():
-    one, many = make_buffer(8), make_buffer(8)
-    data = make_transitions(11)
-    many.extend(data)
-    for row in data.unbind(0):
-        one.add(row)
-    assert same(one.state_dict()["_sampler"], many.state_dict()["_sampler"])
-    rows = [buffer.storage.signal_table.rows for buffer in (one, many)]
-    assert same(rows[0], rows[1])
-
-
 def test_batch_has_the_entries_of_loss_and_update():
     buffer = make_filled(8)
     batch = buffer.sample()
@@ -159,15 +139,6 @@ def test_batch_has_the_entries_of_loss_and_update():
     assert batch["observation"].squeeze(1).equal(batch["index"].float())
     with pytest.warns(UserWarning, match="conflicting batch_sizes"):
         assert buffer.sample(3).batch_size == (3,)
-
-
-def test_batches_of_two_buffers_are_equal_if_their_seeds_are():
-    sampled = []
-    for seed in (1, 1, 2):
-        buffer = make_filled(64, 16, seed=seed)
-        sampled.append(train_rounds(buffer, 5))
-    assert sampled[0].equal(sampled[1])
-    assert not sampled[0].equal(sampled[2])
 
 
 def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):

@@ -13,11 +13,10 @@ import zlib
 from pathlib import Path
 
 import pytest
-import torch
 from torchrl.data import CompressedListStorage, LazyTensorStorage
 from torchrl.data.replay_buffers import RandomSampler
 
-from tests.mpfa.transitions import Trap, make_buffer, make_transitions, rejected, same, train_rounds
+from tests.mpfa.transitions import Trap, make_buffer, make_transitions, rejected, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.saving import MANIFEST, new_dump, open_dump
 
@@ -209,18 +208,6 @@ def test_concurrent_dumps_wait_for_each_other(dumped):
     found = make_buffer(16)
     found.loads(dumped)
     assert len(found) == 3
-
-
-def test_storage_notices_damage_without_a_buffer(tmp_path):
-    first, second = SignalTensorStorage(4), SignalTensorStorage(4)
-    first.set(torch.arange(3), make_transitions(3))
-    first.dumps(tmp_path / "storage")
-    second.loads(tmp_path / "storage")
-    assert same(first.state_dict(), second.state_dict())
-    file = next((tmp_path / "storage").rglob("*.memmap"))
-    file.write_bytes(file.read_bytes()[:-4])
-    with pytest.raises(ValueError, match=f"{file.name} is damaged"):
-        second.loads(tmp_path / "storage")
 
 
 DUMPING = """

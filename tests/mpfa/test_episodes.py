@@ -119,14 +119,6 @@ def test_step_that_begins_where_an_episode_ended_begins_another():
     assert episodes.tolist() == [0, 0, 2, 2]
 
 
-def test_slices_join_steps_at_a_place_that_is_not_a_number():
-    buffer = make_slices(allow_nonfinite=["observation", ("next", "observation")])
-    rows = Robot(0).steps(4)
-    rows["observation"][1] = rows["next", "observation"][0] = torch.nan
-    buffer.extend(rows)
-    assert (buffer.sampler.batch_weights(4) > 0).tolist() == [True, True, False, False]
-
-
 class KeepEpisode:
     """Writes the whole episode once more."""
 

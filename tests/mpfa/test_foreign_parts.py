@@ -21,7 +21,6 @@ from torchrl_mpfa import (
     Adjustment,
     MPFASampler,
     SignalReplayBuffer,
-    SignalSliceSampler,
     SignalTensorStorage,
 )
 from torchrl_mpfa.samplers import TreeSampler
@@ -79,12 +78,6 @@ def test_sampler_without_a_capacity_takes_that_of_the_storage(storage):
     assert same(given.sampler.state_dict(), taken.sampler.state_dict())
     with pytest.raises(ValueError, match=r"max_capacity of the sampler is 16, max_size .* 8"):
         make_buffer(8, storage=storage(8), sampler=taken.sampler)
-
-
-def test_slices_longer_than_the_capacity_of_the_storage_are_rejected():
-    sampler = SignalSliceSampler(None, 0.6, 0.4, slice_len=9)
-    with pytest.raises(ValueError, match="slice_len must be at most max_capacity, 8, got 9"):
-        make_buffer(8, 9, storage=SignalTensorStorage(8), sampler=sampler)
 
 
 def test_signals_follow_each_write_of_two_buffers_that_share_a_storage():
@@ -177,12 +170,6 @@ def test_any_first_call_makes_the_parts(tmp_path):
         assert buffer.storage.signal_table is buffer.sampler.table, name
     with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
         make_delayed().sample()
-
-
-def test_statistics_do_not_make_the_parts():
-    buffer = make_delayed()
-    assert buffer.stats()["initialized"] is False
-    assert not buffer.initialized
 
 
 def test_parts_that_do_not_fit_are_rejected_at_every_use():

@@ -174,15 +174,6 @@ def test_a_signal_without_a_scale_is_not_scaled():
     assert weights.tolist() == [1.0, 1.0]
 
 
-def test_scaled_fusion_passes_the_schedule_on():
-    inner = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
-    fusion = ScaledFusion(inner)
-    assert fusion.every_batch
-    fusion.anneal(1.0)
-    assert inner.weights(TWO, None, None).tolist() == [0.0, 1.0]
-    ScaledFusion(FixedFusion()).anneal(0.5)  # Nothing to tell, and no error.
-
-
 def test_sampler_passes_the_schedule_to_its_fusion():
     fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
     buffer = make_filled(24, 6, fusion=fusion)

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.data import PrioritizedSampler, Sequence, Transition
 
 from tests.mpfa.transitions import (
@@ -101,17 +100,6 @@ def test_times_of_writing_for_half_of_the_batch_are_rejected(buffer):
             storage=buffer.storage,
             written_at=batch["written_at"][:2],
         )
-
-
-def test_an_empty_buffer_cannot_be_sampled_or_updated():
-    buffer = make_buffer(8)
-    before = snapshot(buffer)
-    with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
-        buffer.sample()
-    batch = write_signals(TensorDict({"index": torch.arange(2)}, [2]))
-    with pytest.raises(IndexError, match=r"index must be in \[0, 0\)"):
-        buffer.update_tensordict_priority(batch)
-    assert same(before, snapshot(buffer))
 
 
 NOVELTY = ["td_error", Signal("novelty", key="novelty", known_at="write")]

@@ -1,6 +1,5 @@
 """Save, kill and load: the rest is equal to the last bit, and a wrong state changes nothing."""
 
-import json
 import pickle
 import shutil
 from copy import deepcopy
@@ -76,13 +75,19 @@ def by_checkpoint(first, second, folder):
     Checkpoint(buffer=second).load(folder / "checkpoint")
 
 
-WAYS = [by_state_dict, by_own_file, by_folder, by_moved_folder, by_checkpoint]
 
 
 @UNALLOCATED
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("kind", ["memory", "memmap"])
-@pytest.mark.parametrize("rows", [11, 40], ids=["half full", "wrapped"])
+@pytest.mark.parametrize(
+    ("way", "kind", "rows"),
+    [
+        (by_state_dict, "memory", 11),
+        (by_own_file, "memmap", 40),
+        (by_folder, "memory", 40),
+        (by_moved_folder, "memmap", 11),
+        (by_checkpoint, "memory", 40),
+    ],
+)
 def test_restored_buffer_trains_like_the_uninterrupted_one(way, kind, rows, tmp_path):
     first = make_kind(kind, tmp_path / "first")
     first.extend(make_transitions(rows))
@@ -99,17 +104,6 @@ def test_restored_buffer_trains_like_the_uninterrupted_one(way, kind, rows, tmp_
     assert same(snapshot(first), snapshot(second))
 
 
-def test_plain_values_of_a_saved_sampler_are_in_torchrls_file(tmp_path):
-    buffer = make_kind("memory", tmp_path)
-    buffer.extend(make_transitions(CAPACITY))
-    train_rounds(buffer, 2)
-    buffer.dumps(tmp_path / "buffer")
-    file = tmp_path / "buffer/dump-1/sampler/sampler_metadata.json"
-    found = json.loads(file.read_text(encoding="utf-8"))
-    assert (found["_alpha"], found["_schema_version"]) == (0.6, 1)
-    assert sorted(found["_weights"]) == ["action_gradient", "reward", "td_error"]
-
-
 def test_restored_buffer_shares_no_memory_with_the_first(tmp_path):
     first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
     first.extend(make_transitions(CAPACITY))
@@ -119,19 +113,6 @@ def test_restored_buffer_shares_no_memory_with_the_first(tmp_path):
     resume(first)
     assert same(before, snapshot(second))
     assert same(state["_sampler"], second.state_dict()["_sampler"])
-
-
-@pytest.mark.parametrize("way", ["state", "folder"])
-def test_load_forgets_what_came_after_the_save(way, tmp_path):
-    buffer = make_kind("memory", tmp_path)
-    buffer.extend(make_transitions(CAPACITY))
-    train_rounds(buffer, 5)
-    buffer.dumps(tmp_path / "buffer")
-    before = snapshot(buffer)
-    buffer.extend(make_transitions(20, seed=8))
-    train_rounds(buffer, 5)
-    buffer.load_state_dict(before) if way == "state" else buffer.loads(tmp_path / "buffer")
-    assert same(before, snapshot(buffer))
 
 
 @pytest.mark.parametrize("way", [by_state_dict, by_folder])
@@ -144,13 +125,6 @@ def test_restored_storage_finds_its_device(tmp_path, way):
     way(first, second, tmp_path)
     assert second._storage.device == torch.device("cpu")
     assert len(second.sample()) == 4
-
-
-def test_empty_buffer_is_restored_and_filled():
-    first, second = make_buffer(8), make_buffer(8, seed=5)
-    second.load_state_dict(snapshot(first))
-    second.extend(make_transitions(3))
-    assert len(second) == 3
 
 
 def test_data_that_no_one_may_write_are_restored_without_a_cursor():
@@ -190,14 +164,11 @@ SPOILS = [
     (("_transforms",), {"x": torch.ones(1)}, "Unexpected key"),
     (("_writer", "_cursor"), MISSING, "'_cursor' is missing in the saved writer"),
     (("_writer", "_cursor"), 8, "cursor of the saved writer must be below 8, got 8"),
-    (("_writer", "_cursor"), "1", "cursor must be"),
     (TABLE, MISSING, "'_signals' is missing in the saved sampler"),
     ((*TABLE, "names"), ["td_error"], r"'names' of the saved signals .*, got \['td_error'\]"),
     ((*TABLE, "rows"), MISSING, "'rows' is missing in the saved signals"),
     ((*TABLE, "rows"), torch.ones(7, 6).double(), r"'rows' of the saved .* be \[8, 6\] doubles"),
-    ((*TABLE, "rows"), torch.ones(8, 6), r"'rows' of the saved signals must be \[8, 6\] doubles"),
     ((*TABLE, "size"), -1, "size must be an integer from 0"),
-    ((*TABLE, "writes"), -1, "writes must be an integer from 0"),
     ((*TABLE, "writes"), 7, "times of the saved signals must be below 7, got 7"),
     ((*SAMPLER, "_format"), 3, "version 0.4 saved it: load it with 0.4"),
 ]
@@ -205,7 +176,6 @@ OF_THE_STORAGE = [
     ((*STORAGE, "_len"), MISSING, "'_len' is missing in the saved storage"),
     ((*STORAGE, "_len"), 10**18, r"'_len' of the saved storage must be in \[0, 8\], got 1000"),
     ((*STORAGE, "_len"), 7, "the saved storage has 7 rows, its signals 8"),
-    ((*STORAGE, "initialized"), MISSING, "'initialized' is missing in the saved storage"),
     (OBSERVATION, MISSING, "entry 'observation' is missing"),
     (OBSERVATION, torch.ones(8, 2), r"'observation' must have the shape \[1\] .*, got \[2\]"),
     (OBSERVATION, torch.ones(8, 1).double(), "'observation' must be torch.float32 as in the sto"),

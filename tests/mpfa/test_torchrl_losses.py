@@ -257,20 +257,6 @@ def test_slope_changes_neither_a_batch_normalization_nor_the_random_numbers() ->
     assert training == [module.training for module in loss.modules()]
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", LOSSES)
-def test_loss_that_ignores_weights_gives_one_number_per_transition_for_them(name: str) -> None:
-    """Eq. (11) by hand, as the page says: the mean of weight times loss."""
-    if documented()[name].weighted:
-        return
-    torch.manual_seed(0)
-    loss = LOSSES[name]()
-    loss.make_value_estimator(gamma=0.99)
-    loss.reduction = "none"
-    values = loss(last_steps(name, torch.ones(ROWS)))["loss_qvalue"]
-    assert values.shape[-1] == ROWS
-
-
 def test_page_has_a_row_for_each_loss_with_a_critic() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -283,41 +269,6 @@ def test_page_has_a_row_for_each_loss_with_a_critic() -> None:
     assert {name for name in there if not name.startswith("Dreamer")} == known
     assert documented().keys() == {f"{name}Loss" for name in off_policy}
     assert documented().keys() == LOSSES.keys()
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", LOSSES)
-def test_equal_weights_change_no_loss_as_the_page_says(name: str) -> None:
-    """TorchRL divides by the sum of the weights, Eq. (11) by the number of transitions."""
-    values = []
-    for weight in (1.0, 0.5):
-        torch.manual_seed(0)
-        loss = LOSSES[name]()
-        if name != "DistributionalDQNLoss":
-            loss.make_value_estimator(gamma=0.99)
-        torch.manual_seed(1)
-        values.append(loss(last_steps(name, torch.full((ROWS,), weight))))
-    losses = sorted(key for key in values[0].keys() if key.startswith("loss"))  # noqa: SIM118
-    assert losses
-    for key in losses:
-        torch.testing.assert_close(values[0][key], values[1][key])
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    ("name", "part"),
-    [("TD3Loss", "value_loss"), ("TD3BCLoss", "qvalue_loss"), ("CrossQLoss", "qvalue_loss")],
-)
-def test_td_error_that_a_part_returns_is_written_as_the_page_says(name: str, part: str) -> None:
-    whole, parted = (last_steps(name, torch.ones(ROWS)) for _ in range(2))
-    loss = called(name, whole)
-    mpfa.write_signals(whole, loss)
-    _, extra = getattr(loss, part)(parted)
-    error = extra["td_error"].detach()
-    parted["td_error"] = error if name == "CrossQLoss" else error.amax(0)
-    mpfa.write_signals(parted, loss)
-    for signal in ("td_error", "action_gradient"):
-        assert whole["signals", signal].allclose(parted["signals", signal], rtol=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore")

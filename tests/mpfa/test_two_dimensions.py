@@ -95,38 +95,6 @@ def test_adding_a_step_of_no_environment_is_rejected():
     assert len(buffer) == 0
 
 
-@pytest.mark.parametrize("shape", [(ENVS, STEPS), (ENVS, STEPS, 1)])
-def test_a_priority_that_comes_with_a_transition_lands_on_its_slot(shape):
-    buffer = make_deep_buffer()
-    data = make_trajectories()
-    data["td_error"] = (data["observation"] + 1.0).reshape(shape)
-    buffer.extend(data)
-    expected = buffer.storage[:]["observation"].flatten() + 1.0
-    found = buffer.sampler.priorities()[: ENVS * STEPS] - 0.05
-    torch.testing.assert_close(found, expected.double())
-
-
-def test_rows_that_were_overwritten_are_known_in_two_dimensions():
-    buffer = make_deep_buffer()
-    buffer.extend(make_trajectories(steps=8))
-    batch = write_signals(buffer.sample())
-    buffer.extend(make_trajectories(8, steps=2))
-    buffer.update_tensordict_priority(batch)
-    assert buffer.stale_updates == int((batch["index"][:, 0] < 2).sum()) > 0
-
-
-@pytest.mark.parametrize("steps", [0, 1])
-def test_a_batch_from_before_the_buffer_was_emptied_is_stale_in_two_dimensions(steps):
-    buffer = make_deep_buffer()
-    buffer.extend(make_trajectories(steps=8))
-    batch = write_signals(buffer.sample())
-    buffer.empty()
-    if steps:
-        buffer.extend(make_trajectories(steps=steps))
-    buffer.update_tensordict_priority(batch)
-    assert buffer.stale_updates == 8
-
-
 def test_another_number_of_environments_is_rejected_and_nothing_changes():
     buffer = make_deep_buffer()
     with pytest.raises(ValueError, match=r"max_size must be a multiple of the 5 transitions .* 24"):

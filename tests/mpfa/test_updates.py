@@ -286,11 +286,6 @@ def test_buffers_of_torchrl_are_updated_too(sampler):
         torch.testing.assert_close(found.float(), expected.float(), rtol=1e-4, atol=1e-6)
 
 
-def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
-    run_updates(make_buffer(), make_learner(), updates=2)
-    assert not [each for each in recwarn if "batch_size" in str(each.message)]
-
-
 def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_rejected():
     learner = make_learner()
     buffer = transitions.make_buffer(MANY, None)
@@ -344,19 +339,4 @@ def test_batches_go_to_the_device_of_the_learner_and_signals_come_back(updates, 
     assert batch.device == home
     table = buffer.storage.signal_table
     assert table.rows.device == buffer.sampler.priorities().device == home
-    assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
-
-
-@pytest.mark.parametrize("updates", [1, 3])
-def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
-    # What has no device of its own stands for another one, which not every machine has.
-    learner, buffer = Counting(), make_buffer()
-
-    def prepare(draw):
-        return replace(draw, batch=TensorDict(draw.batch.to_dict(), [len(draw.batch)]))
-
-    _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
-    assert all(each.device is None for each in learner.batches)
-    assert batch.device == torch.device("cpu")
-    table = buffer.storage.signal_table
     assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())

@@ -71,17 +71,9 @@ BAD = {
         changed(("next", "reward"), torch.ones(2, 1, dtype=torch.double)),
         r"\('next', 'reward'\) must be torch.float32 as in the storage, got torch.float64",
     ),
-    "reward without its dimension": (
-        changed(("next", "reward"), torch.ones(2)),
-        r"\('next', 'reward'\) must have the shape \[1\] in each transition, got \[\]",
-    ),
     "wide action": (
         changed("action", torch.ones(2, 3)),
         r"'action' must have the shape \[2\] in each transition, got \[3\]",
-    ),
-    "narrow observation": (
-        changed("observation", torch.ones(2, 1)),
-        r"'observation' must have the shape \[3\] in each transition, got \[1\]",
     ),
     "integer done": (
         changed(("next", "done"), torch.zeros(2, 1, dtype=torch.long)),
@@ -91,13 +83,7 @@ BAD = {
         removed(("next", "observation")),
         r"\('next', 'observation'\) is missing in the transitions",
     ),
-    "nothing next": (removed("next"), r"'next' is missing in the transitions"),
-    "no action": (removed("action"), r"'action' is missing in the transitions"),
     "unknown entry": (changed("loc", torch.ones(2, 2)), r"'loc' is not in the storage"),
-    "unknown nested entry": (
-        changed(("next", "info"), TensorDict({"loc": torch.ones(2)}, [2])),
-        r"\('next', 'info'\) is not in the storage",
-    ),
     "entries in place of a tensor": (
         changed("action", TensorDict({"a": torch.ones(2, 2)}, [2])),
         r"'action' must be a tensor, got TensorDict",
@@ -109,10 +95,6 @@ BAD = {
     "NaN reward": (
         changed(("next", "reward"), NAN),
         r"\('next', 'reward'\) must be finite, got nan in row 1",
-    ),
-    "NaN action": (
-        changed("action", NAN.expand(2, 2)),
-        r"'action' must be finite, got nan in row 1",
     ),
     "infinite next observation": (
         changed(("next", "observation"), torch.tensor([[1.0, 1, 1], [1, -torch.inf, 1]])),
@@ -141,7 +123,7 @@ def buffer(request, tmp_path):
 
 
 @pytest.mark.parametrize("name", BAD)
-@pytest.mark.parametrize("way", ["extend", "add", "lazy stack"])
+@pytest.mark.parametrize("way", ["add", "lazy stack"])
 def test_wrong_transitions_are_rejected_by_name_and_change_nothing(buffer, name, way):
     change, message = BAD[name]
     data = make_full_transitions(2, 9.0)
@@ -149,8 +131,6 @@ def test_wrong_transitions_are_rejected_by_name_and_change_nothing(buffer, name,
     with rejected(buffer, (KeyError, ValueError), message.replace("row 1", "row [01]")):
         if way == "add":
             buffer.add(data[1])
-        elif way == "extend":
-            buffer.extend(data)
         else:
             buffer.extend(lazy_stack(list(data.unbind(0))))
     # What comes next is what would have come without it.
@@ -213,12 +193,6 @@ def test_an_entry_may_be_allowed_to_hold_infinities():
     buffer.load_state_dict(buffer.state_dict())
 
 
-def test_the_transitions_themselves_are_not_changed(buffer):
-    data = make_full_transitions(2)
-    buffer.extend(data)
-    assert "index" not in set(data.keys())
-
-
 def test_transitions_with_gradients_are_stored_without():
     buffer = make_buffer(CAPACITY)
     for _ in range(2):
@@ -231,9 +205,7 @@ def test_transitions_with_gradients_are_stored_without():
 FIRST = {
     "several numbers": torch.ones(2, 3),
     "too few": torch.ones(2, 0),
-    "complex": torch.ones(2, dtype=torch.complex64),
     "not finite": torch.tensor([1.0, torch.inf]),
-    "so high that sums overflow": torch.tensor([1e300, 1.0], dtype=torch.double) ** 2,
     "as high as they can be": torch.tensor([1e308, 1.0], dtype=torch.double),
 }
 
@@ -252,8 +224,7 @@ def test_first_priorities_that_cannot_be_are_rejected_before_anything_is_stored(
     assert len(buffer) == 3
 
 
-@pytest.mark.parametrize("kind", [torch.float64, torch.int64, torch.bool])
-@pytest.mark.parametrize("shape", [(2,), (2, 1)])
+@pytest.mark.parametrize(("kind", "shape"), [(torch.float64, (2,)), (torch.bool, (2, 1))])
 def test_first_priorities_of_any_real_type_are_taken(kind, shape):
     buffer = make_buffer(CAPACITY)
     rows = make_full_transitions(2)
@@ -301,8 +272,9 @@ def test_buffer_works_outside_of_inference_mode_after_use_inside(part):
 ENDS = [torch.uint8, torch.int64, torch.float32, torch.float64]
 
 
-@pytest.mark.parametrize("kind", ENDS)
-@pytest.mark.parametrize("method", ["slices", "reaper", "her", "n-step"])
+@pytest.mark.parametrize(
+    ("kind", "method"), zip(ENDS, ["slices", "reaper", "her", "n-step"], strict=True)
+)
 def test_ends_as_numbers_are_booleans_and_other_numbers_are_rejected_by_name(kind, method):
     def make():
         names = ("td_error",)

@@ -8,10 +8,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import Bounded
 
 from tests.mpfa.learning import (
-    BOUNDS,
     GAMMA,
     KINDS,
     UNTRACED,
@@ -146,13 +144,6 @@ def test_importance_weighs_the_critics_alone_and_divides_by_the_batch_size(kind)
     assert unread["loss_value"].equal(plain["loss_value"])
 
 
-def test_weights_may_be_a_column():
-    learner, batch = make_learner(), make_batch(weighted=True)
-    expected = differentiate(learner, batch)["loss_value"]
-    batch["priority_weight"] = batch["priority_weight"].unsqueeze(1)
-    assert differentiate(learner, batch)["loss_value"].equal(expected)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_gradient_reaches_the_batch_and_only_signals_are_added(kind):
     learner, batch = make_apart(kind), make_batch()
@@ -242,13 +233,6 @@ def test_loss_bends_at_one_in_units_of_the_reward(name):
     assert not torch.allclose(log["loss_value"], other.mean())
 
 
-def test_action_spec_takes_the_place_of_bounds():
-    spec = Bounded(low=-0.5, high=0.5, shape=(2,))
-    assert make_learner("td3", bounds=spec).bounds[1].tolist() == [0.5, 0.5]
-    low, high = torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 10.0])
-    assert make_learner("td3", bounds=(low, high)).bounds[1].tolist() == [2.0, 10.0]
-
-
 @pytest.mark.parametrize("kind", ["td3", "sac"])
 def test_several_critics_start_apart_in_the_range_of_the_one_that_is_given(kind):
     networks = make_networks(stochastic=kind == "sac")
@@ -260,20 +244,3 @@ def test_several_critics_start_apart_in_the_range_of_the_one_that_is_given(kind)
         assert bool((one >= expected.min()).all()) and bool((other <= expected.max()).all())
         assert one.equal(other) == (expected.min() == expected.max())
     assert same(dict(networks[1].named_parameters()), dict(given.named_parameters()))
-
-
-def test_learner_holds_the_networks_that_it_was_given():
-    actor, critic = make_networks()
-    learner = make_learner(networks=(actor, critic))
-    assert learner.policy is actor
-    assert learner.networks["critics"][0] is critic
-
-
-@pytest.mark.parametrize(
-    ("options", "critics", "delay"),
-    [({}, 1, 1), ({"policy_noise": 0.1, "bounds": BOUNDS}, 2, 2), ({"critics": 3}, 3, 1)],
-    ids=str,
-)
-def test_noise_on_the_target_makes_it_td3(options, critics, delay):
-    learner = make_learner("ddpg", **options)
-    assert (len(learner.networks["critics"]), learner.policy_delay) == (critics, delay)

@@ -16,7 +16,6 @@ from tests.mpfa.learning import (
     make_batch,
     make_learner,
     make_networks,
-    without_shortcut,
 )
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import ActorCritic
@@ -172,16 +171,6 @@ def test_parameters_that_are_fixed_stay_as_they_are():
     assert weights[0].equal(before)
 
 
-def test_networks_that_are_called_with_tensordicts_are_traced_as_well():
-    networks = [without_shortcut(*make_networks()) for _ in range(2)]
-    learners = [
-        make_learner(networks=pair, compile=compile)
-        for pair, compile in zip(networks, (False, UNTRACED), strict=True)
-    ]
-    update_both(learners, 0)
-    assert_alike(*learners)
-
-
 def test_learner_that_depends_on_the_numbers_in_a_batch_stays_eager_and_says_so():
     class Choosing(ActorCritic):
         def _learn_actor(self, batch):
@@ -204,20 +193,6 @@ def test_error_of_the_compiler_is_not_reported_as_one_of_the_batch():
     learner = make_learner(compile={"backend": fail})
     with pytest.raises(BackendCompilerFailed, match="no compiler"):
         learner.update(make_batch())
-
-
-def test_running_statistics_count_each_batch_once():
-    counts = []
-    for compile in (False, UNTRACED):
-        actor, critic = make_networks()
-        critic.module.first.insert(1, torch.nn.BatchNorm1d(16))
-        learner = ActorCritic(actor, critic, compile=compile)
-        for seed in range(3):
-            learner.update(make_batch(seed=seed))
-        found = learner.networks.state_dict() | learner.targets.state_dict()
-        counts.append([int(v) for k, v in found.items() if k.endswith("num_batches_tracked")])
-    assert counts[0] == counts[1]
-    assert max(counts[0]) > 0
 
 
 @pytest.mark.slow

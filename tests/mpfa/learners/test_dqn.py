@@ -86,24 +86,6 @@ def test_update_of_dqn_is_that_of_a_plain_loop(double, importance):
         assert torch.allclose(mine, theirs, atol=1e-4)
 
 
-def test_huber_loss_bends_at_one_in_units_of_the_reward():
-    batch = transitions()
-    batch["next", "reward"] *= 0.5
-    squares = batch.clone()
-    torch.manual_seed(0)
-    options = {"reward_scale": 0.5, "importance": "none", "gamma": GAMMA}
-    DQN(network(), loss_function="l2", **options).update(squares)
-    unit = 0.5
-    expected = [
-        0.5 * size**2 if size < unit else unit * (size - 0.5 * unit)
-        for size in (0.5 * squares["signals", "td_error"]).tolist()
-    ]
-    assert min(expected) < 0.5 * unit**2 < max(expected)
-    found = DQN(network(), loss_function="smooth_l1", **options).update(batch)["loss_value"]
-    assert float(found) == pytest.approx(sum(expected) / 12, rel=1e-4)
-    torch.testing.assert_close(batch["signals", "td_error"], squares["signals", "td_error"])
-
-
 def test_learner_with_a_loaded_state_learns_like_the_saved_one():
     first, second = make_dqn(), make_dqn()
     assert isinstance(first, Learner)
@@ -150,15 +132,6 @@ def test_bad_batch_or_state_is_rejected_and_changes_nothing():
     assert all(
         torch.equal(before["networks"][key], after["networks"][key]) for key in before["networks"]
     )
-
-
-def test_ends_that_are_bytes_count_as_booleans():
-    batch, numbers = transitions(), transitions()
-    for key in ("done", "terminated"):
-        numbers["next", key] = numbers["next", key].to(torch.uint8)
-    for each in (batch, numbers):
-        make_dqn().update(each)
-    assert torch.equal(batch["signals", "td_error"], numbers["signals", "td_error"])
 
 
 @pytest.mark.parametrize("form", ["booleans", "floats", "column", "numbers", "column of floats"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.mpfa import learning
-from tests.mpfa.learning import UNTRACED, differentiate, make_batch
+from tests.mpfa.learning import UNTRACED, make_batch
 from tests.mpfa.transitions import same
 from torchrl_mpfa.selection import SampledBatch
 
@@ -89,16 +89,6 @@ def test_actor_moves_as_in_an_update_of_both(name, options):
     found, expected = (parts(learner)["actor"]["weights"] for learner in (alone, both))
     for key, value in expected.items():
         torch.testing.assert_close(found[key], value, rtol=1e-5, atol=1e-7)
-
-
-def test_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
-    learner, other = (after_some_updates("sac") for _ in range(2))
-    torch.manual_seed(3)
-    learner.update(SampledBatch(make_batch(seed=7), trains="actor"))
-    differentiate(other, make_batch(seed=7), seed=3, trains="actor")
-    pairs = zip(learner.policy.parameters(), other.policy.parameters(), strict=True)
-    for parameter, expected in pairs:
-        torch.testing.assert_close(parameter.grad, expected.grad)
 
 
 @pytest.mark.parametrize("name", ["ddpg", "td3"])

@@ -116,14 +116,6 @@ def test_program_is_made_again_for_an_option_that_is_changed(name, value):
     assert_alike(*learners)
 
 
-def test_program_is_made_again_for_another_precision():
-    learners = make_pair("ddpg")
-    for seed in range(4):
-        with torch.autocast("cpu", torch.bfloat16, enabled=seed < 2):
-            update_both(learners, seed)
-    assert_alike(*learners, rtol=1e-3, atol=1e-4)
-
-
 def test_slices_of_other_tensors_need_no_program_of_their_own():
     made = []
     plain, traced = make_pair("ddpg", counting(made))

@@ -48,15 +48,6 @@ def test_batch_with_nan_changes_nothing_and_its_entry_is_named(name, options, up
         assert same(snapshot(learner), before)
 
 
-def test_batch_after_a_rejected_one_has_the_same_effect_as_without():
-    learner, other = make_learner("ddpg"), make_learner("ddpg")
-    with pytest.raises(ValueError, match="batch must be finite"):
-        learner.update(spoiled("observation"))
-    for each in (learner, other):
-        each.update(make_batch(seed=7))
-    assert same(snapshot(learner), snapshot(other))
-
-
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
 @pytest.mark.parametrize("trains", ["critic", "actor"])
 def test_batch_with_infinity_for_critic_or_actor_alone_is_rejected(name, options, trains):
@@ -131,20 +122,16 @@ FIRST, GROUP = ["optimizer", "state", 0], ["optimizer", "param_groups", 0]
     [
         ([], None, "the saved learner must be .*, got None"),
         (["optimizer"], MISSING, "the saved learner lacks 'optimizer'"),
-        (["networks"], MISSING, "the saved learner lacks 'networks'"),
         (["loss"], {}, "the saved learner is of version 0.4, which is not read: finish its run"),
         (["updates"], MISSING, "the saved learner lacks 'updates'"),
         (["updates"], "3", "the saved learner, 'updates' must be 3, got '3'"),
-        (["optimizer"], [], "the saved learner, 'optimizer' must be .*, got a list of 0"),
         (["optimizer", "state"], MISSING, "the saved learner, 'optimizer' lacks 'state'"),
         ([*FIRST, "exp_avg"], MISSING, "'optimizer', 'state', 0 lacks 'exp_avg'"),
         ([*FIRST, "exp_avg"], torch.zeros(1), r"'exp_avg' must be torch.float32 of shape .*\[1\]"),
         ([*FIRST, "exp_avg_sq"], SPOILED, "the saved learner must be finite, got nan in 'exp_a"),
-        ([*FIRST, "step"], torch.zeros(2), r"'step' must be .*\[\], got torch.float32 .*\[2\]"),
         (FIRST, [], "'optimizer', 'state', 0 must be .*, got a list of 0"),
         (["optimizer", "state", 99], {}, "'optimizer', 'state' must not have 99"),
         ([*GROUP, "lr"], "1", "'param_groups', 0, 'lr' must be 0.001, got '1'"),
-        ([*GROUP, "lr"], MISSING, "'param_groups', 0 lacks 'lr'"),
         ([*GROUP, "eps"], math.nan, "the saved learner must be finite, got nan in 'eps'"),
         ([*GROUP, "params"], [0], r"'params' must be a list of \d+, got a list of 1"),
         (
@@ -152,15 +139,11 @@ FIRST, GROUP = ["optimizer", "state", 0], ["optimizer", "param_groups", 0]
             [],
             r"'param_groups' must be a list of \d, got a list of 0",
         ),
-        (["optimizer", "param_groups"], 3, r"'param_groups' must be a list of \d, got 3"),
         (
             ["targets", "other"],
             torch.zeros(1),
             "the saved learner, 'targets' must not have 'other'",
         ),
-        (["targets", "WEIGHT"], MISSING, "the saved learner, 'targets' lacks '"),
-        (["targets", "WEIGHT"], torch.zeros(3), r"must be .* of shape .*, got .* of shape \[3\]"),
-        (["targets", "WEIGHT"], "text", "must be torch.float32 of shape .*, got 'text'"),
         (["targets", "WEIGHT"], SPOILED, "the saved learner must be finite, got nan in '"),
     ],
 )

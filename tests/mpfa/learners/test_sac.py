@@ -28,14 +28,6 @@ def test_temperature_falls_while_the_entropy_is_above_its_target_and_rises_below
     assert log[0]["alpha"] == 1.0
 
 
-def test_fixed_temperature_stays():
-    learner = make_learner(alpha=0.2, alpha_lr=0)
-    for seed in range(3):
-        log = learner.update(make_batch(seed=seed))
-    assert float(log["alpha"]) == pytest.approx(0.2)
-    assert len(learner.optimizer.param_groups) == 2
-
-
 def test_update_moves_everything_and_only_the_critics_have_targets():
     learner = make_learner()
     before = {name: p.detach().clone() for name, p in learner.networks.named_parameters()}

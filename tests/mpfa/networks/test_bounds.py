@@ -9,7 +9,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
 from tests.mpfa.learning import make_batch
-from torchrl_mpfa import ActorCritic, make_actor, make_critic, make_stochastic_actor
+from torchrl_mpfa import make_actor, make_critic, make_stochastic_actor
 from torchrl_mpfa.networks import ActionScale, action_bounds
 
 # TorchRL warns at every loss of its own whose target networks nothing moves.
@@ -123,20 +123,6 @@ def test_random_actions_have_the_density_of_torchrls_distribution():
     with set_exploration_type(ExplorationType.RANDOM):
         sampled = policy(TensorDict(inputs, [50]))["action"]
     assert bool(((sampled >= torch.tensor(LOW)) & (sampled <= torch.tensor(HIGH))).all())
-
-
-def test_learners_train_within_bounds_and_move_no_bound():
-    # The function that would be compiled, which it is not: that takes seconds.
-    compiled = {"policy_noise": 0.2, "bounds": SPEC, "compile": {"disable": True}}
-    for learner in (
-        ActorCritic(*networks(make_actor), **compiled),
-        ActorCritic(*networks(make_stochastic_actor)),
-    ):
-        for _ in range(4):
-            learner.update(batch_of())
-        *_, scale = learner.policy.layers()
-        assert scale.center.tolist() == [0.0, 5.0]
-        assert scale.half_width.tolist() == [2.0, 5.0]
 
 
 def test_spec_may_be_that_of_a_batch_of_environments_or_have_a_key():

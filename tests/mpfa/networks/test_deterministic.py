@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from tests.mpfa.transitions import seeded
@@ -11,15 +10,6 @@ from torchrl_mpfa import make_actor, make_critic
 
 def count(module, kind):
     return sum(isinstance(part, kind) for part in module.modules())
-
-
-@pytest.mark.parametrize("batch_size", [[], [5], [3, 4]])
-def test_shapes_follow_the_batch(batch_size):
-    data = TensorDict({"observation": torch.zeros(*batch_size, 7)}, batch_size)
-    make_actor(7, 3)(data)
-    make_critic(7, 3)(data)
-    assert data["preactivation"].shape == data["action"].shape == (*batch_size, 3)
-    assert data["state_action_value"].shape == (*batch_size, 1)
 
 
 def test_action_is_the_tanh_of_the_preactivation():
@@ -70,12 +60,3 @@ def test_late_action_joins_at_the_second_layer():
     critic = make_critic(7, 2, width=11).module
     assert critic.first[0].in_features == 7
     assert critic.rest[0].in_features == 13
-
-
-@pytest.mark.parametrize("late_action", [True, False])
-def test_value_depends_on_observation_and_action(late_action):
-    critic = make_critic(7, 2, late_action=late_action, final_init=None).module
-    observation, action = torch.randn(4, 7, generator=seeded()), torch.zeros(4, 2)
-    value = critic(observation, action)
-    assert not critic(observation, action + 1).equal(value)
-    assert not critic(observation + 1, action).equal(value)

@@ -1,12 +1,9 @@
 """The stochastic policy: what it samples, and what it does when it is not to explore."""
 
-import pytest
 import torch
 from torchrl.envs import ExplorationType, set_exploration_type
-from torchrl.modules import TanhNormal
 
 from tests.mpfa.learning import make_batch, make_networks
-from torchrl_mpfa.networks import sample_tanh_normal
 
 
 def test_policy_is_the_tanh_of_its_mean_unless_it_explores():
@@ -34,15 +31,3 @@ def test_sizes_of_a_policy_can_be_read_from_its_weights():
     ]
     assert weights[0].shape[1] == 5
     assert weights[-1].shape[0] == 2
-
-
-@pytest.mark.parametrize("loc", [0.0, 1.5, -30.0])
-def test_sampled_actions_and_densities_are_torchrls(loc):
-    means, deviations = torch.full((100, 2), loc), torch.linspace(0.01, 2, 200).reshape(100, 2)
-    torch.manual_seed(0)
-    action, log_density = sample_tanh_normal(means, deviations)
-    torch.manual_seed(0)
-    expected = TanhNormal(means, deviations).rsample_and_log_prob()
-    torch.testing.assert_close(action, expected[0])
-    torch.testing.assert_close(log_density, expected[1])
-    assert action.abs().max() <= 1.0

@@ -1,7 +1,5 @@
 """Each entry of the statistics against a plain computation."""
 
-import math
-
 import pytest
 
 from tests import oracles
@@ -9,8 +7,6 @@ from tests.mpfa.transitions import (
     make_buffer,
     make_filled,
     make_transitions,
-    same,
-    snapshot,
     train_rounds,
     write_signals,
 )
@@ -84,20 +80,6 @@ def test_effective_sample_size_age_and_replays_of_the_last_batch(trained):
     assert counts.min() >= 1
 
 
-def test_statistics_grow_with_known_signals():
-    buffer = make_buffer(8)
-    assert not any("/" in name for name in buffer.stats())
-    buffer.extend(make_transitions(8))
-    assert "positive_fraction_buffer" in buffer.stats()
-    assert "sampled_age_mean" not in buffer.stats()
-    batch = buffer.sample()
-    stats = buffer.stats()
-    assert "entropy/reward" in stats
-    assert "share/reward" not in stats
-    buffer.update_tensordict_priority(write_signals(batch))
-    assert "share/reward" in buffer.stats()
-
-
 def test_a_fusion_without_entropies_has_none_in_the_statistics():
     buffer = make_filled(8, fusion=FixedFusion({"reward": 0.5, "td_error": 0.5}))
     train_rounds(buffer, 1)
@@ -105,17 +87,3 @@ def test_a_fusion_without_entropies_has_none_in_the_statistics():
     assert not any(name.startswith("entropy/") for name in stats)
     assert stats["weight/reward"] == 0.5
     assert stats["weight/action_gradient"] == 0.0
-
-
-def test_every_entry_is_a_plain_finite_number(trained):
-    buffer, _ = trained
-    for name, value in buffer.sampler.stats().items():
-        assert type(value) is float, name
-        assert math.isfinite(value), name
-
-
-def test_reading_statistics_changes_nothing(trained):
-    buffer, _ = trained
-    before = snapshot(buffer)
-    buffer.stats()
-    assert same(before, snapshot(buffer))

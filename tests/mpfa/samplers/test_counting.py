@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from tests.methods.replays import make_buffer
 from tests.mpfa.transitions import make_transitions, restore, seeded, set_signals
 from torchrl_mpfa import Adjustment, PositiveBoost, SignalSampler
-from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import make_replay
 
 
@@ -56,12 +55,6 @@ def test_an_adjustment_counts_after_a_sixteenth_of_the_buffer_changed():
     train(buffer, 1)
     assert census.asked == 3
     assert census.told == [1, 1, 2, 3]
-
-
-def test_every_update_counts_where_the_entropies_are_counted_at_every_update():
-    buffer, census = make_counted(entropy_refresh=0)
-    train(buffer, 5)
-    assert census.asked == 5
 
 
 def test_count_gets_fused_priorities_of_known_signals():
@@ -156,11 +149,3 @@ def test_the_rarer_positive_transitions_are_the_larger_is_phi(level):
         for error, reward in zip(errors.tolist(), rewards.tolist(), strict=True)
     ]
     assert sampler.priorities().tolist() == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize("target", [0.1, 0.5, 0.8])
-def test_of_equal_priorities_the_positive_ones_get_the_share_that_is_wanted(target):
-    for positive in (1, 10, 40):
-        phi = float(adaptive_boost(torch.tensor(positive / 100), target=target, highest=1e9))
-        found = positive * phi / (positive * phi + 100 - positive)
-        assert found == pytest.approx(max(target, positive / 100), rel=1e-5)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer, make_transitions, rejected
-from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal, SignalSampler
+from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal
 from torchrl_mpfa.samplers.table import SignalTable
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
@@ -71,11 +71,6 @@ def test_own_signals_go_from_the_batch_to_the_priority():
     update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
     # 4/4 + 2/2 + 2^2/4 and 0 + 6/2 + 3^2/4
     assert priorities(buffer)[2:4] == pytest.approx([3.0, 5.25])
-
-
-def test_transitions_without_an_own_signal_are_rejected():
-    with pytest.raises(KeyError, match=r"the transitions lack 'surprise': .* at 'surprise'"):
-        make_own_buffer().extend(make_transitions(4))
 
 
 def test_an_own_fusion_and_an_own_adjustment_do_their_work():
@@ -150,10 +145,3 @@ def test_wrong_weights_and_wrong_adjusted_priorities_are_rejected(wrong):
     with pytest.raises(ValueError, match="adjusted priorities must be finite and not negative"):
         update(buffer, [2], td_error=[4.0], novelty=[2.0])
     assert priorities(buffer) == before
-
-
-def test_names_alone_make_learned_signals():
-    sampler = SignalSampler(8, 0.6, 0.4, signals=["td_error", "novelty"])
-    assert [signal.known_at for signal in sampler.signals] == ["update", "update"]
-    assert sampler.signals[1].key == ("signals", "novelty")
-    assert sampler.fusion == FixedFusion({"td_error": 1.0, "novelty": 1.0})

@@ -7,8 +7,6 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBufferEnsemble
 
 from tests.mpfa.transitions import make_filled, make_transitions, write_signals
-from torchrl_mpfa.methods.assembly import make_replay
-from torchrl_mpfa.samplers import TreeSampler
 from torchrl_mpfa.samplers.trees import as_slots
 
 NO_INTEGERS = "index must hold integers, got"
@@ -39,15 +37,6 @@ def test_part_of_an_ensembles_batch_updates_the_priorities_of_its_rows():
         assert changed.tolist() == slots.unique().tolist()
 
 
-def test_part_of_an_ensembles_batch_updates_a_buffer_with_one_signal():
-    buffer = make_filled(sampler=TreeSampler(16, 1.0, 1.0, eps=0.0))
-    td_error = torch.tensor([2.0, 3.0])
-    buffer.update_tensordict_priority(
-        TensorDict({"index": nested([4, 7]), "td_error": td_error}, [2])
-    )
-    assert buffer.sampler.priorities(nested([4, 7])).tolist() == [2.0, 3.0]
-
-
 def test_every_method_reads_the_index_in_a_tensordict():
     buffer, slots = make_filled(), [2, 5]
     buffer.update_priority(nested(slots), torch.tensor([3.0, 4.0]))
@@ -62,12 +51,6 @@ def test_every_method_reads_the_index_in_a_tensordict():
     )
     assert buffer.storage.get(slots)["observation"].flatten().tolist() == [50.0, 51.0]
     assert buffer.storage.signal_table.written_at(torch.tensor(slots)).tolist() == [16.0, 17.0]
-
-
-def test_newest_transition_is_found_by_an_index_in_a_tensordict():
-    sampler = make_replay("cer", capacity=8).buffer.sampler
-    sampler.extend(nested([3, 6]))
-    assert sampler.newest == [6]
 
 
 WRONG = {

@@ -131,14 +131,6 @@ def test_one_signal_is_torchrls_prioritized_replay():
     assert ours.sampler.default_priority == pytest.approx(float(theirs.default_priority))
 
 
-def test_of_a_slot_that_appears_twice_in_a_batch_the_last_entry_counts():
-    buffer = make_filled(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
-    set_signals(buffer, [3, 5, 3, 3], td_error=[9.0, 4, 8, 2], action_gradient=torch.zeros(4))
-    table = buffer.storage.signal_table
-    assert table.rows[[3, 5], table.column["td_error"]].tolist() == [2.0, 4.0]
-    assert priorities(buffer)[[3, 5]].tolist() == [2.0, 4.0]
-
-
 def test_of_slots_that_repeat_among_many_the_last_position_is_found():
     slots = torch.randint(500, (3000,), generator=seeded(1))
     last = {slot: position for position, slot in enumerate(slots.tolist())}
@@ -193,18 +185,6 @@ def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten
         asked.append(fusion.asked)
         buffer.add(make_transitions(1, first=16 + number)[0])
     assert asked == expected
-
-
-def test_the_refresh_is_a_share_of_the_transitions_and_not_of_the_capacity():
-    fusion = CountingFusion()
-    buffer = make_buffer(1000, fusion=fusion, entropy_refresh=0.25)
-    buffer.extend(make_transitions(8))
-    asked = []
-    for number in range(4):
-        buffer.update_tensordict_priority(write_signals(buffer.sample()))
-        asked.append(fusion.asked)
-        buffer.add(make_transitions(1, first=8 + number)[0])
-    assert asked == [1, 1, 1, 2]  # The third of eight transitions is more than a quarter.
 
 
 def test_a_refresh_of_zero_counts_at_every_update_even_if_nothing_was_written():

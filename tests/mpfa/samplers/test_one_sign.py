@@ -35,16 +35,6 @@ def test_one_warning_names_the_cure(sign, share, options):
     assert buffer.sampler.weights["td_error"] == buffer.sampler.weights["action_gradient"] == 0.0
 
 
-@pytest.mark.parametrize("reward", [0.0, -1.0])
-def test_rewards_that_are_all_equal_need_no_cure(reward):
-    buffer = make_buffer(2000, 32)
-    buffer.extend(make_transitions(1000, rewards=torch.full((1000,), reward)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        train_rounds(buffer, 1)
-    assert [*buffer.sampler.weights.values()] == pytest.approx([1 / 3] * 3)
-
-
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 @pytest.mark.parametrize("level", ["mean", -8.0])
 def test_the_cure_gives_every_signal_its_weight(level):
@@ -68,23 +58,6 @@ def test_mean_as_level_causes_a_warning_of_equal_weights(make):
     with pytest.warns(UserWarning, match="equal weights for any data") as told:
         make()
     assert len(told) == 1
-
-
-def test_own_weights_with_the_mean_cause_no_warning():
-    fusion = FixedFusion({"reward": 1.0, "td_error": 2.0})
-    MPFASampler(8, fusion=fusion, positive_above="mean")
-
-
-@pytest.mark.filterwarnings("ignore:positive_above='mean'")
-@pytest.mark.parametrize("share", [0.001, 0.3, 0.9])
-@pytest.mark.parametrize("population", ["buffer", "batch"])
-def test_the_mean_as_level_does_make_all_weights_equal(share, population):
-    rewards = torch.rand(400, generator=seeded(1)) - share
-    fusion = EntropyFusion(population=population)
-    buffer = make_buffer(400, 64, fusion=fusion, positive_above="mean", entropy_refresh=0)
-    buffer.extend(make_transitions(400, rewards=rewards))
-    train_rounds(buffer, 2)
-    assert [*buffer.sampler.weights.values()] == [1 / 3] * 3
 
 
 def test_the_mean_of_the_buffer_reaches_the_boost():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import TensorDictMaxValueWriter, TensorDictReplayBuffer
+from torchrl.data import TensorDictMaxValueWriter
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
@@ -215,9 +215,7 @@ def test_loaded_buffer_of_slices_trains_like_the_saved_one(
         ("_joined", MISSING, "'_joined' is missing"),
         ("_joined", torch.ones(3, dtype=torch.bool), r"must be torch.bool of shape \[60\]"),
         ("_stride", 7, "'_stride' .* a divisor of 60, got 7"),
-        ("slice_len", 5, "'slice_len' .* must be 4, got 5"),
         ("slice_priority", "start", "'slice_priority' .* must be 'mean', got 'start'"),
-        ("strict_length", False, "'strict_length' .* must be True, got False"),
         ("_kind", "signals", "'_kind' .* must be 'slices', got 'signals'"),
     ],
 )
@@ -247,14 +245,6 @@ def test_rounding_never_samples_what_has_the_probability_zero(monkeypatch):
     assert set(starts.tolist()) <= set(slices_by_hand(buffer))
 
 
-def test_alpha_holds_for_the_priorities_of_slices():
-    buffer = filled()
-    buffer.sampler.alpha = 0.0
-    leaf = leaves_of(buffer.sampler._sum_tree, torch.arange(CAPACITY))
-    assert sorted(slices_by_hand(buffer)) == leaf.nonzero().squeeze(1).tolist()
-    assert leaf.unique().tolist() == [0.0, 1.0]
-
-
 def test_emptied_buffer_has_no_old_slices():
     buffer = filled()
     buffer.empty()
@@ -262,16 +252,6 @@ def test_emptied_buffer_has_no_old_slices():
     with pytest.raises(RuntimeError, match="no trajectory in the buffer has 4 steps"):
         buffer.sample()
     buffer.extend(make_steps(LENGTH - 1, 8))
-    check_leaves(buffer)
-    assert len(buffer.sample()) == 8
-
-
-def test_steps_of_a_filled_storage_are_cut_into_trajectories():
-    storage = SignalTensorStorage(CAPACITY, ndim=2)
-    TensorDictReplayBuffer(storage=storage, batch_size=1, dim_extend=1).extend(make_steps(0, 9))
-    buffer = SignalReplayBuffer(
-        storage=storage, sampler=choices(SignalSliceSampler, slice_len=LENGTH), batch_size=8
-    )
     check_leaves(buffer)
     assert len(buffer.sample()) == 8
 
@@ -362,8 +342,3 @@ def test_steps_without_the_end_of_their_trajectory_are_rejected_before_they_are_
     ):
         buffer.extend(make_steps(0, 5).exclude(("next", "done")))
     assert len(buffer) == 0
-
-
-def test_a_sampler_without_a_storage_cannot_know_where_trajectories_end():
-    with pytest.raises(ValueError, match="storage must be given"):
-        choices(SignalSliceSampler, slice_len=LENGTH).mark_update(0)

@@ -6,7 +6,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.samplers.test_trees import MADE
 from tests.mpfa.second_device import DEVICE
-from tests.mpfa.transitions import make_buffer, make_rows, make_transitions, rejected, same, seeded
+from tests.mpfa.transitions import make_buffer, make_rows, make_transitions, same, seeded
 from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.samplers import TreeSampler
@@ -166,33 +166,6 @@ def test_a_state_of_one_device_loads_on_the_other(kind, first):
     assert same(loaded.storage.signal_table.rows.cpu(), saved.storage.signal_table.rows.cpu())
 
 
-def test_the_same_seed_samples_the_same_batches_there():
-    first, second = (make_there().sample()["index"].tolist() for _ in range(2))
-    assert first == second
-    buffer = make_there()
-    buffer.sample()
-    assert buffer.sample()["index"].tolist() != first
-
-
-WRONG = [
-    ([0, 1], [1.0, float("nan")], ValueError),
-    ([0, 1], [1.0, -1.0], ValueError),
-    ([0, CAPACITY], [1.0, 1.0], IndexError),
-]
-
-
-@pytest.mark.parametrize(("slots", "values", "error"), WRONG)
-def test_wrong_update_is_rejected_there_and_changes_nothing(slots, values, error):
-    buffer = make_there()
-    value = torch.tensor(values).to(DEVICE)
-    with rejected(buffer.sampler, error):
-        buffer.sampler.update_signals(
-            torch.tensor(slots).to(DEVICE),
-            {"td_error": value, "action_gradient": value},
-            storage=buffer.storage,
-        )
-
-
 def test_priorities_of_zero_are_not_sampled_from_there():
     sampler = TreeSampler(4, 1.0, 0.4, 0.0)
     buffer = ReplayBuffer(
@@ -203,18 +176,3 @@ def test_priorities_of_zero_are_not_sampled_from_there():
     buffer.update_priority(torch.arange(2), torch.zeros(2))
     with pytest.raises(RuntimeError, match="every priority must be positive"):
         buffer.sample()
-
-
-@pytest.mark.parametrize("first", [DEVICE, CPU])
-@pytest.mark.parametrize("count", [0, 2])
-def test_a_folder_of_one_device_loads_on_the_other(first, count, second_device, tmp_path):
-    if second_device is not None:
-        pytest.skip("files are not mapped to what stands for a GPU")
-    second = CPU if first == DEVICE else DEVICE
-    saved, loaded = make_there(device=first), make_there(device=second, count=count)
-    give_signals(saved, torch.arange(BATCH))
-    saved.dumps(tmp_path / "dump")
-    loaded.loads(tmp_path / "dump")
-    assert loaded.sample()["observation"].device == loaded.sampler.device == second
-    assert same(loaded.sampler.priorities().cpu(), saved.sampler.priorities().cpu())
-    assert same(loaded.storage.signal_table.rows.cpu(), saved.storage.signal_table.rows.cpu())

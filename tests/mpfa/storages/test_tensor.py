@@ -3,8 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict, lazy_stack
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictMaxValueWriter
-from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.data import LazyTensorStorage, TensorDictMaxValueWriter
 
 from tests.mpfa.transitions import (
     make_buffer,
@@ -15,7 +14,7 @@ from tests.mpfa.transitions import (
     seeded,
     write_signals,
 )
-from torchrl_mpfa import MPFASampler, Signal, SignalMemmapStorage, SignalTensorStorage
+from torchrl_mpfa import Signal, SignalMemmapStorage, SignalTensorStorage
 
 KINDS = ["memory", "memmap", "memmap_scratch"]
 
@@ -118,13 +117,6 @@ def test_a_batch_larger_than_the_storage_leaves_signals_of_the_rows_that_stay(ma
     assert buffer.stale_updates == 0
 
 
-def test_a_list_of_transitions_is_written_like_a_batch(make_storage):
-    storage = make_storage(4)
-    buffer = ReplayBuffer(storage=storage, sampler=MPFASampler(4), batch_size=2)
-    buffer.extend(list(make_transitions(3, rewards=[1.0, -2.0, 3.0]).unbind(0)))
-    assert storage.signal_table.rewards.tolist() == [1.0, -2.0, 3.0]
-
-
 def test_a_writer_that_keeps_the_best_keeps_signals_and_data_together():
     storage = SignalTensorStorage(4)
     buffer = make_buffer(4, storage=storage)
@@ -217,12 +209,6 @@ def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
     buffer = make_buffer(4, signals=["td_error", bad])
     with rejected(buffer, ValueError, r"signal 'bad' must be finite and not negative, got -1.0"):
         buffer.extend(make_transitions(1, rewards=[1.0]))
-
-
-def test_torchrls_own_sampler_may_sample_the_storage():
-    buffer = ReplayBuffer(storage=SignalTensorStorage(8), sampler=RandomSampler(), batch_size=4)
-    buffer.extend(torch.arange(5.0))
-    assert buffer.sample().shape == (4,)
 
 
 def test_rows_that_are_written_out_of_order_count_as_in_torchrl():
