@@ -75,8 +75,6 @@ def by_checkpoint(first, second, folder):
     Checkpoint(buffer=second).load(folder / "checkpoint")
 
 
-
-
 @UNALLOCATED
 @pytest.mark.parametrize(
     ("way", "kind", "rows"),
