@@ -117,11 +117,6 @@ def test_a_drive_controller_fills_the_fields_left_out(tmp_path: Path) -> None:
     assert values_of(robot, OWN) == OWN
 
 
-def test_nav2_fills_the_fields_left_out(tmp_path: Path) -> None:
-    robot = robot_of(tmp_path, {"wheel_base": 0.3, "wheel_radius": 0.04}, NAV2)
-    assert values_of(robot, PLANNED) == pytest.approx(PLANNED)
-
-
 @pytest.mark.parametrize("texts", [(DRIVE, NAV2), (NAV2, DRIVE)])
 def test_of_two_limits_the_smaller_one_counts(texts: tuple[str, str], tmp_path: Path) -> None:
     smaller = {
@@ -215,10 +210,3 @@ def test_an_error_names_the_line_of_both_files(text: str, message: str, tmp_path
     own |= {"min_wheel_speed": -0.5} if "max_vel" in text else {"max_wheel_speed": 0.5}
     with pytest.raises(RobotFileError, match=rf"cart\.yaml:1: .*controller0\.yaml{message}"):
         robot_of(tmp_path, own, text)
-
-
-@pytest.mark.parametrize("path", ["missing.yaml", "."])
-def test_a_missing_file_is_an_error_at_the_robots_line(path: str, tmp_path: Path) -> None:
-    (tmp_path / "cart.yaml").write_text(f"mass: 3\ncontroller: {path}\n", encoding="utf-8")
-    with pytest.raises(RobotFileError, match=r"cart\.yaml:2: controller: .*: cannot be read: "):
-        load_robot(tmp_path / "cart.yaml")

@@ -143,23 +143,6 @@ def test_a_slower_robot_drives_the_same_arcs_more_slowly(tmp_path: Path) -> None
     assert (found.right - found.left) / 0.16 == pytest.approx(found.angular)
 
 
-@pytest.mark.parametrize("pace", [None, 0.5])
-def test_a_pilot_with_a_filter_does_not_drive_into_a_wall(pace: float | None) -> None:
-    robot = ROBOTS["kobuki"]
-    facts = card(robot=robot, sectors=36, field_of_view=360.0, observation_size=42)
-    ahead = np.ones((1, 2), np.float32)
-    scan = Scan(-math.pi, math.pi / 180, np.full(360, 2.0))
-    wall = np.full(360, 2.0)
-    wall[150:211] = 0.3
-    for clearance, slower in ((None, False), (0.03, True)):
-        pilot = Pilot(facts, lambda _: ahead, pace=pace, clearance=clearance)
-        pilot.begin((4.0, 0.0))
-        still = (0.0, 0.0, 0.0), (0.35, 0.0)
-        assert pilot.decide(scan, *still).linear == pytest.approx(0.7 * pilot.pace)
-        near = pilot.decide(scan._replace(ranges=wall), *still)
-        assert (near.linear < 0.6 * pilot.pace) == slower
-
-
 def test_a_new_goal_clears_the_map_unlike_a_moved_one(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path, 27, memory="map"))
     ahead = Scan(-math.pi / 2, math.pi / 90, np.full(91, 1.0))
@@ -203,18 +186,6 @@ def own_robot(wheel_base: float, slowest: float) -> RobotModel:
         name="own", radius=0.18, height=0.3, mass=5.0, wheel_base=wheel_base, wheel_radius=0.05,
         min_wheel_speed=slowest, max_wheel_speed=0.5,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("robot", ["turtlebot2", "turtlebot4", "burger", own_robot(0.35, -0.5)])
-def test_no_wheel_exceeds_its_speed_range(robot: str | RobotModel) -> None:
-    scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
-    for action in ((-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, -1.0)):
-        pilot = Pilot(card(), lambda _, a=action: np.array([a], np.float32), robot=robot)
-        pilot.begin((4.0, 0.0))
-        command, own = pilot.decide(scan, *still), pilot.robot
-        spare = 0.021 * (own.max_wheel_speed - own.min_wheel_speed)
-        for speed in (command.left, command.right):
-            assert own.min_wheel_speed - spare <= speed <= own.max_wheel_speed + spare
 
 
 def test_a_robot_too_coarse_for_the_sharpest_arcs_is_rejected() -> None:

@@ -116,15 +116,6 @@ def test_sct_is_the_time_of_the_shortest_path_at_full_speed_over_the_time_taken(
     assert sct(success, time_s=time_s, shortest_path=3.0, speed=0.5) == expected
 
 
-def test_full_speed_is_that_of_the_robot_that_drives() -> None:
-    for name, speed in (("td3-turtlebot2", 0.5), ("td3-rooms", 0.7)):
-        results = evaluate(load_policy(name), "A", episodes=2, physics="kinematic")
-        assert any(each.success for each in results)
-        for each in results:
-            expected = each.success * each.shortest_path / speed / each.time_s
-            assert each.sct == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("physics", ["kinematic", "wheels"])
 def test_results_do_not_depend_on_how_many_run_at_once(physics: str) -> None:
     policy = steering_policy(max_steps=60, lidar={"noise": 0.01})

@@ -4,16 +4,13 @@ import hashlib
 import math
 import random
 from collections import Counter
-from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.ndimage import label
 
 from benchmarks.speed.worlds import measure
 from mpfa_envs import (
     GENERATORS,
-    Box,
     Cylinder,
     NavigationEnv,
     VectorNavigationEnv,
@@ -154,81 +151,6 @@ def test_a_world_without_a_task_is_sampled_again_but_not_forever(
     )
     with pytest.raises(ValueError, match="'closets-3' cannot be made: none of 100 attempts"):
         generate_world("closets", 3)
-
-
-def gap(one: Box, other: Box) -> float:
-    across = max(one.x_min - other.x_max, other.x_min - one.x_max, 0.0)
-    up = max(one.y_min - other.y_max, other.y_min - one.y_max, 0.0)
-    return math.hypot(across, up)
-
-
-@pytest.mark.parametrize(("difficulty", "boxes", "passage"), [(0, 8, 1.1), (0.5, 13, 0.9)])
-def test_obstacles_of_rooms_touch_or_leave_a_passage(
-    difficulty: float, boxes: int, passage: float
-) -> None:
-    touching = [0, 0, 0, 0]
-    for seed in range(20):
-        world = generate_world("rooms", seed, difficulty=difficulty)
-        assert len(world.boxes) == boxes
-        assert all(gap(a, b) >= passage for a, b in combinations(world.boxes, 2))
-        for box in world.boxes:
-            sides = sorted((box.x_max - box.x_min, box.y_max - box.y_min))
-            assert 0.5 - 1e-9 <= sides[0] <= 0.5 + 1e-9 or sides[1] == pytest.approx(0.5)
-            assert sides[1] <= 2.6 + 1e-9
-            gaps = [a - b for a, b in zip(box.bounds, world.room.bounds, strict=True)]
-            assert all(each == 0.0 or abs(each) >= passage for each in gaps)
-            touching = [n + (each == 0.0) for n, each in zip(touching, gaps, strict=True)]
-    # At each wall there are boxes that make dead ends.
-    assert min(touching) > 15
-
-
-@pytest.mark.parametrize("difficulty", [0.0, 0.5, 1.0])
-def test_every_place_of_a_maze_can_be_reached(difficulty: float) -> None:
-    half = (1.5 - 0.7 * difficulty) / 2
-    wider = []
-    for seed in range(15):
-        world = generate_world("mazes", seed, difficulty=difficulty)
-        grid = FreeGrid(world, distance=half - 0.04, resolution=0.05)
-        assert label(grid.free)[1] == 1, world.name
-        wider.append((grid.clearance > half + 0.01).sum() / grid.free.sum())
-    # Only where walls fell there is more room than in a corridor.
-    assert np.mean(wider) < (0.3 if difficulty == 1.0 else 0.75)
-
-
-def test_a_field_has_a_path_from_end_to_end() -> None:
-    counts = []
-    for seed in range(40):
-        world = generate_world("fields", seed, difficulty=seed / 39)
-        counts.append(len(world.cylinders))
-        grid = FreeGrid(world, distance=0.25)
-        parts, _ = label(grid.free)
-        # The open strips lie along the first and the last row, or column.
-        middle = world.size[0] / 2 - 0.5, world.size[1] / 2 - 0.5
-        ends = (
-            [parts[grid.index(0.0, sign * middle[1])] for sign in (-1, 1)],
-            [parts[grid.index(sign * middle[0], 0.0)] for sign in (-1, 1)],
-        )
-        assert any(first == last != 0 for first, last in ends), world.name
-    assert sum(counts[20:]) > 1.5 * sum(counts[:20])
-    assert 60 < sum(counts) / 40 < 300
-
-
-def test_halls_are_up_to_20_m_with_obstacles_at_any_angle() -> None:
-    worlds = [generate_world("halls", seed) for seed in range(40)]
-    sides = [side for world in worlds for side in world.size]
-    assert 10.0 <= min(sides) < 11.0 and 19.0 < max(sides) <= 20.0
-    polygons = [polygon for world in worlds for polygon in world.polygons]
-    assert any(not polygon.is_convex for polygon in polygons)
-    assert {len(polygon.vertices) for polygon in polygons} == set(range(3, 8))
-    angles = [math.atan2(y1 - y0, x1 - x0) for x0, y0, x1, y1 in (p.edges[0] for p in polygons)]
-    assert all(sum(low < a <= low + 0.8 for a in angles) > 20 for low in np.arange(-3.1, 2.4, 0.8))
-    assert any(world.cylinders for world in worlds)
-
-
-def test_mixed_worlds_are_of_all_kinds() -> None:
-    kinds = Counter(GENERATORS["mixed"](random.Random(seed), 0.5).name for seed in range(120))
-    assert set(kinds) == set(NAMES) - {"mixed", "crowd"}
-    assert min(kinds.values()) > 8
 
 
 def test_a_crowd_has_two_to_ten_walkers_six_by_default() -> None:

@@ -64,15 +64,6 @@ def test_obstacles_lie_left_of_their_edges_and_the_room_right() -> None:
     assert math.pi * 0.25 < cylinder < 1.05 * math.pi * 0.25
 
 
-def test_only_an_approaching_robot_is_avoided() -> None:
-    world = World(name="free", walkers=(AVOIDER,))
-    wanted = np.array([1.0, 0.0])
-    for heading, avoided in ((math.pi, True), (0.0, False)):
-        robot = (2.0, 1.6, heading, 1.0, 0.0)
-        found = chosen(world, (0.0, 1.5), robot)
-        assert (np.hypot(*(found - wanted)) > 0.05) == avoided
-
-
 def test_a_velocity_into_a_wall_is_not_driven(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

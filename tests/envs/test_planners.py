@@ -157,13 +157,6 @@ def test_a_blocked_goal_has_no_path(search: Search) -> None:
     assert search(FreeGrid(FULL, distance=0.25), (0.0, 0.0), (0.1, 0.0)) is None
 
 
-@pytest.mark.parametrize("search", [shortest_path, AntColony(ants=3, iterations=2)])
-def test_a_goal_in_the_starts_cell_has_a_path(search: Search) -> None:
-    path = search(FreeGrid(WORLDS["A"], distance=0.25), (0.01, 0.02), (0.04, 0.03))
-    assert path is not None
-    assert (path[0], path[-1]) == ((0.01, 0.02), (0.04, 0.03))
-
-
 def test_pursuit_drives_on_the_arc_to_the_point_ahead() -> None:
     grid = FreeGrid(WORLDS["A"], distance=0.25)
     # Ahead by the look-ahead distance, on a circle of 1.5 m to the left.

@@ -17,7 +17,6 @@ from mpfa_envs import (
     VectorNavigationEnv,
     navigation_reward,
 )
-from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.tasks.reward import payments_of
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
@@ -49,17 +48,6 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
         assert env.world == many.worlds[robot]
         assert env.task == many.tasks[robot]
     many.close()
-
-
-def test_a_seed_repeats_worlds_that_change_with_each_episode(env: NavigationEnv) -> None:
-    seen = []
-    for seed in (3, None, None, None, np.int64(3), None):
-        observation, info = env.reset(seed=seed)
-        assert env.observation_space.contains(observation)
-        assert tuple(info) == tuple(INFO_TYPES)
-        seen.append(env.world.name)
-    assert len(set(seen[:4])) == 4
-    assert seen[4:] == seen[:2]
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -43,7 +43,7 @@ def plain(scan: Scan, reduction: str, mount: tuple[float, float, float]) -> list
 
 
 @pytest.mark.parametrize("reduction", ["min", "median", "single"])
-@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (-0.04, 0.02, -1.0)])
+@pytest.mark.parametrize("mount", [(-0.04, 0.02, -1.0)])
 @pytest.mark.parametrize(
     ("start", "step", "count"),
     [(-math.pi, math.tau / 360, 360), (0.001, math.tau / 719, 719), (3.1, -math.tau / 640, 640)],
@@ -155,8 +155,7 @@ def test_a_lidar_that_falls_silent_at_once_is_dead(dead: float) -> None:
         assert (sectors.read(hall())[0] == 10.0).all()
 
 
-@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -1.0])
-@pytest.mark.parametrize("roll", [math.pi, -math.pi, 3.1])
+@pytest.mark.parametrize(("yaw", "roll"), [(0.0, 3.1), (-1.0, -math.pi)])
 def test_a_lidar_upside_down_is_read_from_right_to_left(yaw: float, roll: float) -> None:
     rng = np.random.default_rng(0)
     ranges = rng.uniform(0.5, 6.0, 360)
@@ -166,27 +165,6 @@ def test_a_lidar_upside_down_is_read_from_right_to_left(yaw: float, roll: float)
     np.testing.assert_allclose(found, Sectors(card(), mount=(-0.04, 0.02, yaw)).read(upright)[0])
     flat = Sectors(card(), mount=(-0.04, 0.02, yaw, 0.0)).read(upright)[0]
     assert flat.tolist() == found.tolist()
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "blind"),
-    [
-        (-180, 179, 0), (0, 359, 0), (-175, 175, 2), (-135, 135, 18), (-90, 90, 36), (90, 270, 36),
-        (-45, 45, 54),
-    ],
-)  # fmt: skip
-def test_directions_that_no_ray_looks_at_are_blind(first: int, last: int, blind: int) -> None:
-    count = last - first + 1
-    scan = Scan(math.radians(first), math.pi / 180, np.ones(count))
-    facts = card(sectors=36, field_of_view=360.0, observation_size=42)
-    found, hidden = Sectors(facts).blind(scan)
-    assert len(found) == pytest.approx(blind, abs=1)
-    seen = np.radians(np.arange(first, last + 1))
-    off = np.abs((found[:, None] - seen + math.pi) % math.tau - math.pi)
-    assert (off > math.radians(1.0)).all()
-    assert hidden.sum() == pytest.approx(blind / 2, abs=1)
-    turned, _ = Sectors(facts, mount=(0.0, 0.0, 1.0, math.pi)).blind(scan)
-    assert len(turned) == pytest.approx(blind, abs=1)
 
 
 @pytest.mark.parametrize(("count", "off"), [(360, 0), (359, 0), (361, 0), (330, 29), (375, -16)])
@@ -236,7 +214,7 @@ RANGES = np.linspace(0.3, 7.9, 360)
 
 @pytest.mark.parametrize("scale", [1000.0, 100.0])
 @pytest.mark.parametrize("limits", [(0.1, 8.0), (0.1, math.inf)])
-@pytest.mark.parametrize("scales", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("scales", [(1.0, 0.0), (0.0, 1.0)])
 def test_a_scan_in_another_unit_is_rejected(
     scale: float, limits: tuple[float, float], scales: tuple[float, float]
 ) -> None:
@@ -264,9 +242,9 @@ def seen_by(robot: RobotModel, pose: tuple[float, float, float]) -> Scan:
     return simulated.scan()
 
 
-@pytest.mark.parametrize("view", [180.0, 240.0, 360.0])
-@pytest.mark.parametrize("mount", [(0.12, 0.0, 0.0), (-0.1, 0.04, 0.0), (0.12, 0.0, 0.0, math.pi)])
-@pytest.mark.parametrize("pose", [(0.0, -1.3, 0.0), (-2.2, 0.3, 2.0), (0.1, 0.0, 1.2)])
+@pytest.mark.parametrize("view", [180.0, 360.0])
+@pytest.mark.parametrize("mount", [(-0.1, 0.04, 0.0), (0.12, 0.0, 0.0, math.pi)])
+@pytest.mark.parametrize("pose", [(-2.2, 0.3, 2.0), (0.1, 0.0, 1.2)])
 def test_a_pilot_reads_what_the_training_senses_wherever_the_lidar_is(
     pose: tuple[float, float, float], mount: tuple[float, ...], view: float
 ) -> None:
@@ -282,9 +260,9 @@ def test_a_pilot_reads_what_the_training_senses_wherever_the_lidar_is(
     assert np.abs(ROOM.clearances(np.stack((x, y), axis=1))).max() < 1e-6
 
 
-@pytest.mark.parametrize("view", [180, 240, 270])
-@pytest.mark.parametrize("x", [0.0, 0.1, -0.1])
-@pytest.mark.parametrize("silent", ["reject", "far"])
+@pytest.mark.parametrize(
+    ("view", "x", "silent"), [(180, 0.1, "reject"), (240, -0.1, "far"), (270, 0.0, "reject")]
+)
 def test_what_lies_beyond_the_last_ray_is_not_seen(x: float, view: int, silent: str) -> None:
     robot = replace(ROBOTS["kobuki"], field_of_view=float(view), lidar_mount=(x, 0.0, 0.0))
     facts = card(robot=ROBOTS["kobuki"], sectors=36, field_of_view=360.0)

@@ -25,7 +25,6 @@ from mpfa_envs import (
     navigation_reward,
 )
 from tests.envs.busy import BUSY, POLITE, STANDING, needs
-from tests.envs.shapes import SCATTERED
 
 ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, drift=0.05)
 TASKS = [None, Task((-4.0, 0.0, 1.0), (4.0, 0.0)), None]
@@ -33,8 +32,6 @@ CASES: dict[str, dict[str, Any]] = {
     "worlds": {"world": ["B", "D", "test"], "action_repeat": 3},
     "path": {"world": "bars", "progress": "shortest_path", "lidar": {"noise": 0.02}},
     "kept": {"world": "mixed", "episodes_per_world": 3, "autoreset_mode": AutoresetMode.SAME_STEP},
-    "harder": {"world": "rooms", "episodes_per_world": 3, "difficulty": 0.7, "split": "validation"},
-    "slow wheels": {"world": ["A", "B"], "robot": "kobuki"},
     "physics": {"world": ["A", "D"], "physics": "wheels"},
     "history": {"world": ["B", "D"], "history": 3, "action_repeat": 1, "lidar": {"noise": 0.02}},
     "noise": {"world": "rooms", "noise": ALL, "memory": "map"},
@@ -42,7 +39,6 @@ CASES: dict[str, dict[str, Any]] = {
     "crowd": {"world": "crowd"},
     "walkers": {"world": [BUSY, STANDING], "lidar": {"noise": 0.02}},
     "orca": {"world": [POLITE]},
-    "field": {"world": [SCATTERED], "progress": "shortest_path"},
 }
 
 
@@ -133,11 +129,8 @@ SPOILED: list[tuple[Callable[[Any], None], str]] = [
     (lambda state: state["arguments"].pop("split"), "split = 'train', got one with None"),
     (value(5, "arguments", "num_envs"), "num_envs = 2, got one with 5"),
     (value(-1, "rejected"), "rejected must be an integer of at least 0, got -1"),
-    (value([None], "seeded"), "robots and seeded must have 2 entries"),
     (value([{}, None], "seeded"), "state must be for a PCG64|KeyError"),
-    (value([{}], "robots"), "robots and seeded must have 2 entries, got 1"),
     (value({}, "robots", 0), "no state_dict"),
-    (value(-1, "robots", 0, "generator", "state", "inc"), "OverflowError"),
     (value(later, "robots", 0, "generator"), "end elsewhere"),
     (value(-1, "robots", 0, "left"), "left must be an integer of at least 0, got -1"),
     (value(1, "robots", 0, "left"), "kept must name a generator's world, got None"),
@@ -149,13 +142,10 @@ SPOILED: list[tuple[Callable[[Any], None], str]] = [
         value(lambda robot: {**robot, "left": 1, "kept": "halls-7"}, "robots", 0),
         "world 'halls-7' must be at most",
     ),
-    (value([[0.0]], "robots", 0, "speeds"), "cannot reshape"),
     (value([[9.0, 0.0]], "robots", 0, "speeds"), "speeds .* at most 1050 pairs from .* to 0.5"),
-    (value([[np.nan, 0.0]], "robots", 0, "speeds"), r"speeds .* \[nan\]"),
     (value(np.zeros((1999, 2)), "robots", 0, "speeds"), "speeds .* at most 1050 pairs"),
     (value(np.full((250, 2), 0.5), "robots", 0, "speeds"), r"continue after .* robots \[0\]"),
     (value(lambda speeds: speeds[:-1], "robots", 1, "speeds"), "end elsewhere"),
-    (value(lambda speeds: speeds[::-1], "robots", 1, "speeds"), "end elsewhere"),
     (value(np.zeros((3, 2)), "positions"), r"positions must have shape \(2, 2\)"),
 ]
 
@@ -185,19 +175,13 @@ def test_a_state_that_is_rejected_changes_nothing(
 
 OTHERS: list[tuple[dict[str, Any], str]] = [
     ({"world": "mixed"}, r"world = 'A \(.{8}\)', got one with 'mixed'"),
-    ({"world": ["A", "B"]}, r"world = 'A \(.{8}\)', got one with \['A .*', 'B .*'\]"),
     ({"world": World(name="A", boxes=(Box(1.0, 1.0, 2.0, 2.0),))}, "world = .*, got .*'A "),
     ({"robot": replace(ROBOTS["burger"], mass=2.0)}, "robot.mass = 1.0, got one with 2.0"),
     ({"progress_scale": 99.0}, "progress_scale = 5.0, got one with 99.0"),
     ({"reward": partial(navigation_reward, goal_reward=3.0)}, "goal_reward = 10.0, got .* 3.0"),
     ({"reward": lambda outcome: RewardTerms()}, "reward = 'navigation_reward', got .* of your own"),
     ({"lidar": {"reduction": "median"}}, "lidar.reduction = 'min', got one with 'median'"),
-    ({"lidar": {"dropout": 0.1}}, "lidar.dropout = 0.0, got one with 0.1"),
     ({"noise": ALL}, "noise = None, got one with "),
-    ({"detour_chance": 0.0}, "detour_chance = 0.8, got one with 0.0"),
-    ({"max_goal_distance": 5.0}, "max_goal_distance = inf, got one with 5.0"),
-    ({"episodes_per_world": 2}, "episodes_per_world = 1, got one with 2"),
-    ({"split": "validation"}, "split = 'train', got one with 'validation'"),
     ({"autoreset_mode": AutoresetMode.SAME_STEP}, "autoreset_mode = 'NextStep', got .*'SameStep'"),
 ]
 

@@ -6,11 +6,9 @@ import sys
 import time
 from collections.abc import Iterator
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled
-from gymnasium.utils.play import PlayableGame
 
 from mpfa_envs import NavigationEnv
 from mpfa_envs.scene.window import Window
@@ -100,16 +98,6 @@ def test_without_pygame_the_error_says_what_to_install(monkeypatch: pytest.Monke
     env = NavigationEnv(physics="kinematic", render_mode="human")
     with pytest.raises(DependencyNotInstalled, match="needs pygame: install the extra 'live'"):
         env.reset(seed=0)
-
-
-def test_gymnasium_can_play_it_by_keyboard() -> None:
-    env = gymnasium.make("mpfa/Navigation-A-v1", physics="kinematic", render_mode="rgb_array")
-    env.reset(seed=0)
-    keys = {"w": np.ones(2, np.float32), "a": np.array([-1.0, 1.0], np.float32)}
-    game = PlayableGame(env, {(ord(key),): action for key, action in keys.items()})
-    game.process_event(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_w))
-    assert set(game.pressed_keys) == {ord("w")}
-    env.close()
 
 
 def test_triton_can_be_imported_after_a_window_was_opened(

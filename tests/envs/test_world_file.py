@@ -39,36 +39,21 @@ def test_the_example_can_be_driven_in(physics: str) -> None:
     env.close()
 
 
-def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
-    (tmp_path / "hall.yaml").write_text("size: [4, 4]\n")
-    assert load_world(tmp_path / "hall.yaml").name == "hall"
-
-
 @pytest.mark.parametrize(
     ("text", "line", "message"),
     [
         ("size: [4, 4]\nboxs: []\n", 2, "unknown key 'boxs' in the file; did you mean 'boxes'"),
-        ("size: [4, 4]\nzzzzz: 1\n", 2, "unknown key 'zzzzz' in the file; known are name, size"),
         ("name: x\n", 1, "size is missing"),
         ("- 1\n", 1, "the file must be a mapping"),
-        ("", 1, "the file must be a mapping"),
         ("size: [4]\n", 1, r"size must be \[width, depth\], got 1 entries"),
-        ("size: 4\n", 1, "size must be a list"),
         ("size: [4, wide]\n", 1, "size must be a number in meters, got 'wide'"),
-        ("size: [4, -4]\n", 1, "size must be two positive lengths"),
         ("size: [4, 4]\nname: [a]\n", 2, "name must be text"),
         ("size: [4, 4]\nsize: [5, 5]\n", 2, "key 'size' appears twice"),
-        ("size: [4, 4]\nboxes: 3\n", 2, "boxes must be a list"),
         ("size: [4, 4]\nboxes:\n  - 3\n", 3, "an entry of boxes must be a mapping"),
         (
             "size: [4, 4]\ncylinders:\n  - {x: 0, y: 0, radius: 1}\n  - {x: 0, y: 0}\n",
             4,
             "an entry of cylinders lacks the key 'radius'",
-        ),
-        (
-            "size: [4, 4]\ncylinders:\n  - {x: 0, y: 0, radius: -1}\n",
-            3,
-            "cylinder must have a positive radius",
         ),
         (
             "size: [4, 4]\nboxes:\n  - {x_min: 1, x_max: 0, y_min: 0, y_max: 1}\n",
@@ -79,11 +64,6 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
             "size: [4, 4]\nboxes:\n  - {x_min: 1, x_max: 3, y_min: 0, y_max: 1}\n",
             3,
             "boxes must lie in the room",
-        ),
-        (
-            "size: [4, 4]\nboxes:\n  - {x_min: 1, xmax: 3, y_min: 0, y_max: 1}\n",
-            3,
-            "unknown key 'xmax' in an entry of boxes; did you mean 'x_max'",
         ),
         (
             "size: [4, 4]\nboxes:\n  - {x_min: -1, x_max: 1, y_min: -1, y_max: 1}\n"
@@ -112,18 +92,8 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
             "start must have at most 1000 entries, got 1001",
         ),
         ("size: [4, 1_0]\n", 1, "size must be a number in meters, got '1_0'"),
-        ("size: [4, ١]\n", 1, "size must be a number in meters"),
-        ("size: [4, 4]\npolygons: 3\n", 2, "polygons must be a list"),
-        ("size: [4, 4]\npolygons:\n  - 3\n", 3, "an entry of polygons must be a list"),
         ("size: [4, 4]\npolygons:\n  - [[0, 0], 1]\n", 3, "a vertex must be a list"),
-        ("size: [4, 4]\npolygons:\n  - [[0, 0], [1]]\n", 3, r"a vertex must be \[x, y\], got 1"),
-        ("size: [4, 4]\npolygons:\n  - [[0, 0], [1, a]]\n", 3, "a vertex must be a number in m"),
         ("size: [4, 4]\npolygons:\n  - [[0, 0], [1, 0]]\n", 3, "polygon must have 3 to 100 vert"),
-        (
-            "size: [4, 4]\npolygons:\n  - [[0, 0], [1, 0], [0, 1]]\n  - [[0, 0], [3, 0], [0, 1]]\n",
-            4,
-            "polygons must lie in the room",
-        ),
         ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),
     ],
