@@ -248,7 +248,7 @@ def test_arrays_on_the_page_on_offline_data_are_stored_and_change_the_priorities
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("seed", range(1, 7))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_pieces_and_sums_on_the_page_on_sequences_are_of_one_trajectory(seed: int) -> None:
     torch.manual_seed(seed)
     names = run("howto/sequences.md", {"seed=0": f"seed={seed}"})

@@ -196,19 +196,6 @@ def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: 
     assert "making .venv" not in done.stdout  # The environment itself is kept.
 
 
-@pytest.mark.parametrize("goal", ["demo", "train", "paper"])
-def test_what_only_tests_need_is_installed_for_them_alone(copy: Path, goal: str) -> None:
-    add_program(copy / "bin" / "python3.11", PRETENDER)
-    done = make(copy, ".venv/.installed")  # The goals' own commands have nothing to run here.
-    assert [line for line in done.stdout.splitlines() if "installing" in line] == [
-        "== installing in .venv, silently; the first time this downloads PyTorch, some gigabytes"
-    ]
-    assert pip_calls(copy) == [SCRIPTS]
-    assert "pip install" not in make(copy, "-n", goal).stdout
-    assert make(copy, "test").returncode == 0
-    assert pip_calls(copy) == [SCRIPTS, REST]
-
-
 def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: Path) -> None:
     add_program(copy / "bin" / "python3.11", PRETENDER)
     other = LATER.replace("/somewhere 3.11", "/somewhere 3.12")
@@ -236,12 +223,6 @@ def test_an_install_that_failed_is_made_again(copy: Path) -> None:
     (copy / "no_network").unlink()
     assert make(copy, "test").returncode == 0
     assert pip_calls(copy) == [SCRIPTS, REST]
-
-
-def test_another_build_of_torch_is_installed_before_the_project(copy: Path) -> None:
-    add_program(copy / "bin" / "python3.11", PRETENDER)
-    assert make(copy, "test", "TORCH_INSTALL_ARGS=./torch-cpu.whl").returncode == 0
-    assert pip_calls(copy) == ["-m pip install -q ./torch-cpu.whl", SCRIPTS, REST]
 
 
 def test_other_arguments_for_torch_install_again_and_the_same_or_none_do_not(copy: Path) -> None:

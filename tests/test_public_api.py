@@ -1,13 +1,16 @@
-"""What the package promises: its names, their docstrings, and examples that run."""
+"""What the packages promise: names, their docstrings, modules after a bare import."""
 
 import ast
 import inspect
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import torchrl_mpfa
+from torchrl_mpfa.lazy import GONE
 
 NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]
 
@@ -70,3 +73,96 @@ def test_every_argument_of_a_public_name_is_described(name):
 
 def test_the_version_is_one():
     assert re.fullmatch(r"\d+\.\d+\.\d+([.-]?\w+)?", torchrl_mpfa.__version__)
+
+
+ROOT = Path(__file__).parent.parent
+_LOOK = """
+import sys
+from functools import reduce
+import {package}
+for name in sys.argv[1:]:
+    reduce(getattr, name.split("."), {package})
+"""
+_NEED_ROS = ("ros.policy_node", "ros.robot_node")
+
+
+def documented(package, alias):
+    """Dotted names of modules and what is in them, as the pages have them."""
+    pages = {ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    found = set(re.findall(rf"\b(?:{package}|{alias})\.([a-z_]+(?:\.\w+)*)(?=[`(\s])", text))
+    files = {
+        ".".join(path.relative_to(ROOT / folder / package).with_suffix("").parts)
+        for folder in (".", "envs")
+        for path in (ROOT / folder / package).rglob("*.py")
+    }
+    modules = {name for name in found if any(f"{name}.".startswith(f"{file}.") for file in files)}
+    return sorted(modules - set(_NEED_ROS))
+
+
+@pytest.mark.parametrize(
+    ("package", "names"),
+    [
+        ("torchrl_mpfa", ["saving.save_atomically", "methods.her.HindsightGoals"]),
+        ("mpfa_envs", ["worlds.barn.barn_world", "deploy.map_path", "generators.resolve"]),
+    ],
+)
+def test_a_module_is_there_after_a_bare_import(package, names):
+    look(package, names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "alias"), [("torchrl_mpfa", "mpfa"), ("mpfa_envs", "mpfa_envs")]
+)
+def test_every_documented_module_is_there_after_a_bare_import(package, alias):
+    names = documented(package, alias)
+    assert len(names) > 10
+    # A later one must not be there because of an earlier one: both orders.
+    look(package, names)
+    look(package, names[::-1])
+
+
+def look(package, names):
+    code = _LOOK.format(package=package)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *names],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("package", ["torchrl_mpfa", "mpfa_envs"])
+def test_an_unknown_name_is_an_attribute_error(package):
+    code = f"import {package}\nassert not hasattr({package}, 'no_such_module')"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+PAGE = ROOT / "docs" / "from_0_4.md"
+LOSSES, LEARNERS, STORAGES = (f"torchrl_mpfa.{name}" for name in ("losses", "learners", "storages"))
+PACKAGES = {
+    "SignalStorageMixin": [STORAGES],
+    "SignalTable": [STORAGES],
+    "hydra": ["torchrl_mpfa.integrations"],
+    "SignalLoss": [LOSSES],
+    "MultiTensorSoftUpdate": [LEARNERS],
+    "ReplayHistory": ["torchrl_mpfa", "torchrl_mpfa.history"],
+    "make_value_table": ["torchrl_mpfa.networks"],
+    "check_adjustment": ["torchrl_mpfa.testing"],
+    "check_fusion": ["torchrl_mpfa.testing"],
+}
+"""Packages that a name was in, if that was not the first."""
+
+
+@pytest.mark.parametrize("name", GONE)
+def test_name_that_went_says_what_replaces_it(name):
+    further = LEARNERS if name.endswith("Learner") else LOSSES
+    for package in PACKAGES.get(name, ["torchrl_mpfa", further]):
+        with pytest.raises(
+            ImportError, match=f"{name} is no longer there since 0.5: use "
+        ) as error:
+            exec(f"from {package} import {name}", {})
+        assert GONE[name] in str(error.value)
+    assert name in PAGE.read_text(encoding="utf-8")

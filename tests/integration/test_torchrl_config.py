@@ -21,8 +21,6 @@ from tests.integration.test_torchrl_trainer import assert_learned
 from torchrl_config import main, train
 from torchrl_mpfa import (
     MPFASampler,
-    SignalMemmapStorage,
-    SignalSampler,
     SignalTensorStorage,
 )
 from torchrl_mpfa.integrations.trainer import PriorityStepper
@@ -76,18 +74,6 @@ def test_the_policy_that_collects_has_the_weights_that_were_learned() -> None:
     for name, weights in collecting.items():
         assert weights.data_ptr() != learned[name].data_ptr()
         assert weights.equal(learned[name])
-
-
-def test_other_classes_fit_the_same_places() -> None:
-    trainer = tiny(
-        "sampler._target_=torchrl_mpfa.SignalSampler",
-        "sampler.alpha=0.7",
-        "storage._target_=torchrl_mpfa.SignalMemmapStorage",
-    )
-    assert type(trainer.replay_buffer.sampler) is SignalSampler
-    assert trainer.replay_buffer.sampler.alpha == 0.7
-    assert type(trainer.replay_buffer.storage) is SignalMemmapStorage
-    assert_learned(trainer, "td_error")
 
 
 def test_many_robots_in_the_worlds_of_a_generator_are_one_setting_away() -> None:

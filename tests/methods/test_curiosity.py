@@ -55,6 +55,18 @@ def test_losses_are_their_formulas():
     assert log["forward_loss"].item() == pytest.approx(forward, rel=1e-4)
 
 
+def test_model_whose_loss_has_no_share_does_not_move():
+    curiosity = Curiosity(6, 2, forward_share=1.0)
+    models = curiosity.inverse_model, curiosity.forward_model
+    before = [[p.clone() for p in model.parameters()] for model in models]
+    curiosity(make_batch())
+    moved = [
+        any(not p.equal(q) for p, q in zip(model.parameters(), old, strict=True))
+        for model, old in zip(models, before, strict=True)
+    ]
+    assert moved == [False, True]
+
+
 def test_bonus_is_computed_at_each_sampling_and_the_reward_is_kept():
     curiosity, stored = Curiosity(6, 2), make_batch()
     first, second = stored.clone(), stored.clone()

@@ -56,6 +56,7 @@ def test_parts_are_right_after_the_ring_buffer_has_wrapped():
 def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)
+    assert make_la3p(30, 4, uniform_fraction=0.25).sampler.sizes(8) == (2, 6)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
     with pytest.raises(TypeError, match="buffer must have an LA3PSampler, got SignalSampler"):
         next(la3p_batches(other))

@@ -136,18 +136,6 @@ def test_flipped_bit_is_noticed_or_harmless(tmp_path):
     assert noticed > 190
 
 
-def test_damage_is_noticed_anywhere_in_a_large_file(tmp_path):
-    path = tmp_path / "state.pt"
-    save_atomically({"a": torch.zeros(700_000)}, path)
-    whole = path.read_bytes()
-    for place in (0.1, 0.5, 0.9):
-        damaged = bytearray(whole)
-        damaged[int(place * len(whole))] ^= 1
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"state\.pt is damaged: its checksum is wrong"):
-            load_safely(path)
-
-
 @pytest.mark.parametrize("wrong", [torch.nan, torch.tensor([0.0, torch.inf])])
 def test_saved_number_that_is_not_finite_is_found_in_any_depth(wrong):
     state = {"groups": [{"lr": 1.0, "params": (3, "a", None)}], "weight": torch.zeros(2)}

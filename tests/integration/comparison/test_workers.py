@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.integration.comparison.test_compare import (
-    EPISODES,
-)
-from tests.integration.tiny_runs import OVERRIDES
+import compare
+from tests.integration.comparison.test_compare import InThisProcess, assert_same_rows, comparison
 from training import files
+from training.comparison import execution
 from training.comparison.jobs import SCRIPTS, Evaluation, Job
 from training.comparison.workers import LocalWorker, Lost
 from training.records import read_table
 
-SETTINGS = [
-    *OVERRIDES,
-    *("evaluation.every=30", "evaluation.episodes=2", "evaluation.world=A"),
-    *("tracking.log_every=10", EPISODES.format(6)),
-]
 WANTED = Evaluation(("B", "rooms:7-8"), 2, "wheels")
 
 
@@ -64,26 +59,6 @@ def assert_same_run(one: Job, other: Job) -> None:
             read_table(job.path / name).drop(columns=timed, errors="ignore") for job in (one, other)
         )
         assert len(found) and found.equals(expected), name
-
-
-@pytest.mark.slow
-def test_runs_of_one_worker_are_those_of_the_scripts_alone_also_after_one_that_failed(
-    tmp_path: Path, worker: LocalWorker
-) -> None:
-    settings = {"td3": [*SETTINGS, "learner.compile=true"], "ddpg": SETTINGS}
-    make(worker, Job("td3", "mpfa_per", 5, tmp_path), [*settings["td3"], "threads=2"])
-    failed = Job("sac", "per", 0, tmp_path)
-    failed.path.mkdir()
-    (failed.path / files.CHECKPOINT).write_bytes(b"no checkpoint")
-    worker.start(failed.trains(SETTINGS), failed.path / "output.log")
-    assert end_of(worker) == 2
-    assert "damaged or not a checkpoint" in (failed.path / "output.log").read_text()
-    for learner, asked in settings.items():
-        job, alone = (Job(learner, "mpfa_per", 0, tmp_path / name) for name in ("one", "alone"))
-        make(worker, job, asked)
-        for command in (alone.trains(asked), alone.evaluates(WANTED)):
-            subprocess.run([sys.executable, *command], check=True, capture_output=True)
-        assert_same_run(job, alone)
 
 
 @pytest.mark.slow
@@ -140,3 +115,55 @@ def test_a_script_whose_output_has_no_room_says_so_and_its_worker_stays(
         end_of(worker)
     worker.start(help_text, Path("/dev/null"))
     assert end_of(worker) == 0
+
+
+ray = pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    """Two machines of one core; the first one has the comparison."""
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        yield made
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def test_a_comparison_loses_a_machine_and_gives_the_rows_of_one_machine(
+    tmp_path: Path,
+    cluster: Any,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    other = cluster.add_node(num_cpus=1)
+    arguments = [*comparison(tmp_path / "ray", "--ray", cluster.address, length=60)]
+    arguments.append("checkpoint_every=20")
+
+    def lose() -> None:
+        """Take the second machine away once both runs have a checkpoint."""
+        runs = [tmp_path / "ray" / f"ddpg-{name}-0" for name in ("mpfa_per", "uniform")]
+        while not all((run / files.CHECKPOINT).exists() for run in runs):
+            time.sleep(0.05)
+        cluster.remove_node(other, allow_graceful=False)
+
+    thread = Thread(target=lose, daemon=True)
+    thread.start()
+    assert compare.main(arguments) == 0
+    assert not thread.is_alive()
+    assert capsys.readouterr().out.count("its worker is gone, resumes at its last") == 1
+    # Neither run was begun twice.
+    assert not list((tmp_path / "ray").glob(f"*/{files.PREVIOUS}"))
+
+    arguments[1] = str(tmp_path / "serial")
+    arguments.remove("--ray")
+    arguments.remove(cluster.address)
+    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
+    assert compare.main(arguments) == 0
+    assert_same_rows(tmp_path / "ray", tmp_path / "serial")
+    kept = json.loads((tmp_path / "ray" / files.SETTINGS).read_text())
+    assert set(kept["runs"]) == {"ddpg-mpfa_per-0", "ddpg-uniform-0"}

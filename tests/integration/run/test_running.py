@@ -15,12 +15,13 @@ from torch.utils import cpp_extension
 from tests.integration.tiny_runs import OVERRIDES, tiny, train
 from torchrl_mpfa import Learner
 from training.files import CHECKPOINT
-from training.run import loop
+from training.run import compiling, loop
 from training.run.assembly import make_learner
+from training.run.compiling import is_compiled
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, prepare_process, start
 from training.settings.command_line import composed
-from training.settings.train import TrainSettings
+from training.settings.train import TrainSettings, register
 
 
 def begin(folder: Path) -> int:
@@ -133,3 +134,37 @@ def test_an_error_of_the_program_is_no_sentence(
     monkeypatch.setattr(TrainingRun, "_iterate", fails)
     with pytest.raises(RuntimeError, match="a bug"):
         begin(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "compiled"),
+    [
+        ("", True),
+        ("curriculum.stages=[{world:A,actions:20000}]", True),
+        ("curriculum.stages=[{world:A,actions:19999}]", False),
+        ("curriculum.stages=[{world:A,actions:100}] learner.compile=true", True),
+        ("learner.compile=false", False),
+        ("learner=sac", True),
+        ("learner=dqn", False),
+        ("regime=paper", True),
+        ("regime=paper curriculum=A", True),
+        ("regime=paper curriculum.stages=[{world:A,episodes:49}]", False),
+    ],
+)
+def test_a_run_is_compiled_by_its_settings_and_length(
+    arguments: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "has_compiler", lambda: True)
+    register()
+    (settings,) = composed(["environment.physics=kinematic", *arguments.split()])
+    assert is_compiled(settings) == compiled
+
+
+def test_without_a_compiler_a_long_run_says_that_it_is_eager(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    register()
+    (settings,) = composed([])
+    monkeypatch.setenv("CXX", "/nonexistent")
+    assert not is_compiled(settings)
+    assert "there is no C++ compiler" in capsys.readouterr().out

@@ -19,7 +19,7 @@ import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
 from torchrl_mpfa.stopping import SIGNALS
-from training import figures, files
+from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.finished import after_the_end
@@ -81,24 +81,6 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert job.is_trained()
     (job.path / files.POLICY).unlink()
     assert not job.is_trained()
-
-
-def test_charts_that_were_interrupted_are_drawn_when_the_run_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    begin(tmp_path, episodes=1)
-    with monkeypatch.context() as patch:
-        patch.setattr(figures, "plot_learning_curve", interrupted)
-        assert go_on(tmp_path, STAGES.format(2)) == 128 + signal.SIGINT
-    assert not (tmp_path / files.CURVE).exists()
-    policy = (tmp_path / files.POLICY).read_bytes()
-    monkeypatch.setattr(sys, "argv", ["train.py", f"resume={tmp_path}"])
-    train.main()
-    assert (tmp_path / files.CURVE).exists()
-    assert (tmp_path / files.POLICY).read_bytes() == policy
 
 
 def test_a_finished_run_without_an_episode_has_no_curve_and_is_not_trained_again(

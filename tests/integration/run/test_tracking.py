@@ -283,19 +283,6 @@ def test_what_evaluate_py_finds_is_in_the_wandb_run_of_the_training(
     assert len(kept.rows) == before + 1 and not (tmp_path / "wandb").exists()
 
 
-@pytest.mark.parametrize(
-    ("places", "shows"),
-    [({}, False), ({"csv": True}, False), ({"csv": True, "tensorboard": True}, True)],
-    ids=["nowhere", "csv", "csv and tensorboard"],
-)
-def test_pictures_are_made_where_a_log_can_show_them(
-    places: dict[str, bool], shows: bool, tmp_path: Path
-) -> None:
-    tracker = Tracker(TrainSettings(tracking=TrackingSettings(**places)), tmp_path, run_id=None)
-    assert tracker.shows == shows
-    tracker.close()
-
-
 @pytest.mark.parametrize("every", [None, 0, 20])
 def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     every: int | None, tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch

@@ -86,14 +86,6 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path,
     assert_same_run(go_on(tmp_path, settings), whole)
 
 
-def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
-    first, again = train(tmp_path / "a", tiny()), train(tmp_path / "b", tiny())
-    other = tiny()
-    other.seed = 4
-    assert rows(first) == rows(again)
-    assert rows(first) != rows(train(tmp_path / "c", other))
-
-
 ACTORS = ("ddpg", "sac", "td3")
 PAIRS = list(product(sorted(GROUPS["method"]), ACTORS))
 
@@ -171,22 +163,6 @@ def test_a_finished_run_begins_further_worlds_as_its_curriculum_says(tmp_path: P
     assert resumed.train()
     resumed.close()
     assert len(resumed.buffer) == sum(record.steps for record in resumed.records[3:])
-
-
-def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Path) -> None:
-    settings = tiny(episodes=[Stage("A", actions=40), Stage("B", actions=20)])
-    settings.evaluation.every, settings.evaluation.episodes = 40, 2
-    failing = TrainingRun(settings, tmp_path)
-
-    def fail() -> None:
-        raise RuntimeError("out of memory")
-
-    failing._evaluate = fail
-    with pytest.raises(RuntimeError, match="out of memory"):
-        failing.train()
-    failing.close()
-    whole = train(tmp_path / "whole", settings)
-    assert rows(go_on(tmp_path, settings)) == rows(whole)
 
 
 def test_the_episodes_that_another_stage_cuts_short_are_counted(tmp_path: Path) -> None:

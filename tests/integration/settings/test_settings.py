@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from functools import reduce
@@ -341,3 +342,19 @@ def test_settings_of_a_run_whose_robots_drove_on_ray_are_rejected(usual: TrainSe
     assert as_settings({**saved, "ray": {"workers": 0, "steps": 16}}) == as_settings(saved)
     with pytest.raises(ValueError, match=r"ray\.workers must be 0, got 2"):
         as_settings({**saved, "ray": {"workers": 2}})
+
+
+ROOT = Path(__file__).parents[3]
+SCRIPT = runpy.run_path(str(ROOT / ".ci" / "settings_page.py"))
+PAGE = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
+
+
+def test_the_page_has_every_setting_with_the_defaults_that_hold_in_each_regime() -> None:
+    assert SCRIPT["page"]() == PAGE, "run: python .ci/settings_page.py"
+    for row in (
+        "| `robots` | rooms: `16`<br>paper: `1` |",
+        "| `learner.tau` | rooms: `0.005`<br>paper: `0.01` |",
+        "| `evaluation.world` | rooms: `mazes:validation`<br>paper: `validation` |",
+        "| `method.alpha` | `0.6` |",
+    ):
+        assert row in PAGE

@@ -12,9 +12,7 @@ from torchrl_mpfa import (
     DQN,
     Learner,
     make_value_network,
-    run_updates,
 )
-from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.selection import SampledBatch
 
 ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
@@ -195,21 +193,3 @@ def test_transitions_of_several_steps_are_discounted_by_all_of_them():
         expected.append(abs(float(batch["next", "reward"][row]) + bootstrap - value))
     learner.update(batch)
     assert batch["signals", "td_error"].tolist() == pytest.approx(expected, abs=1e-4)
-
-
-def test_learner_learns_which_action_pays_with_mpfa_per_of_two_signals():
-    replay = make_replay(
-        "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
-        generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
-    rows = transitions(200)
-    rows["next", "reward"] = rows["action"][:, 2:3].float()
-    rows["next", "terminated"][:] = True
-    replay.buffer.extend(rows.exclude("priority_weight"))
-    learner = make_dqn()
-    for _ in range(60):
-        run_updates(replay.buffer, learner, replay.select, updates=4)
-    found = learner.policy.outputs({"observation": torch.rand(50, SIZE)})
-    assert (found["action"].argmax(-1) == 2).all()
-    assert (found["action"].sum(-1) == 1).all()
-    assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))

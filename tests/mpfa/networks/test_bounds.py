@@ -91,14 +91,6 @@ def test_layers_lead_from_the_observation_to_the_greedy_action(maker):
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_spec_of_minus_one_to_one_needs_no_last_layer(maker):
-    plain = make(maker, None)
-    bounded = make(maker, Bounded(low=-1.0, high=1.0, shape=(2,)))
-    assert plain.state_dict().keys() == bounded.state_dict().keys()
-    assert len(plain.layers()) == len(bounded.layers())
-
-
-@pytest.mark.parametrize("maker", MAKERS)
 def test_bounds_are_saved_with_the_policy(maker):
     first = make(maker)
     second = make(maker, Bounded(low=-9.0, high=9.0, shape=(2,)))

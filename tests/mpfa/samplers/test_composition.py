@@ -5,12 +5,10 @@ import pytest
 from tests import oracles
 from tests.mpfa.transitions import (
     make_buffer,
-    make_filled,
     make_transitions,
     train_rounds,
     write_signals,
 )
-from torchrl_mpfa import FixedFusion
 
 NAMES = ["td_error", "action_gradient", "reward"]
 
@@ -78,12 +76,3 @@ def test_effective_sample_size_age_and_replays_of_the_last_batch(trained):
     counts = table.rows[batch["index"], table.count_column]
     assert stats["replay_count_mean"] == pytest.approx(float(counts.mean()))
     assert counts.min() >= 1
-
-
-def test_a_fusion_without_entropies_has_none_in_the_statistics():
-    buffer = make_filled(8, fusion=FixedFusion({"reward": 0.5, "td_error": 0.5}))
-    train_rounds(buffer, 1)
-    stats = buffer.stats()
-    assert not any(name.startswith("entropy/") for name in stats)
-    assert stats["weight/reward"] == 0.5
-    assert stats["weight/action_gradient"] == 0.0

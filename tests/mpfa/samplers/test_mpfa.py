@@ -26,7 +26,6 @@ from torchrl_mpfa import (
     PositiveDecay,
     SignalSampler,
 )
-from torchrl_mpfa.samplers.trees import last_of_each
 
 
 def priorities(buffer):
@@ -131,13 +130,6 @@ def test_one_signal_is_torchrls_prioritized_replay():
     assert ours.sampler.default_priority == pytest.approx(float(theirs.default_priority))
 
 
-def test_of_slots_that_repeat_among_many_the_last_position_is_found():
-    slots = torch.randint(500, (3000,), generator=seeded(1))
-    last = {slot: position for position, slot in enumerate(slots.tolist())}
-    assert last_of_each(slots).tolist() == [last[slot] for slot in sorted(last)]
-    assert last_of_each(torch.randperm(3000, generator=seeded(2))) is None
-
-
 def test_a_fresh_transition_gets_the_highest_priority_in_the_buffer_before_alpha():
     buffer = make_buffer(16)
     buffer.extend(make_transitions(4))
@@ -185,13 +177,6 @@ def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten
         asked.append(fusion.asked)
         buffer.add(make_transitions(1, first=16 + number)[0])
     assert asked == expected
-
-
-def test_a_refresh_of_zero_counts_at_every_update_even_if_nothing_was_written():
-    fusion = CountingFusion()
-    buffer = make_filled(16, fusion=fusion, entropy_refresh=0.0)
-    train_rounds(buffer, 3)
-    assert fusion.asked == 3
 
 
 def test_weights_counted_over_the_batch_are_those_of_each_batch():

@@ -203,13 +203,6 @@ def test_of_a_slot_that_appears_twice_the_last_entry_counts(count):
         assert torch.as_tensor(tree[torch.arange(50)]).tolist() == expected
 
 
-def test_a_priority_of_zero_that_was_learned_twice_is_still_learned():
-    sampler = TreeSampler(4, 1.0, 0.4, 0.0, max_priority_within_buffer=True)
-    for _ in range(2):
-        sampler.update_priority([0], torch.tensor([0.0]))
-        assert sampler.default_priority == 0.0
-
-
 def test_slot_of_the_highest_priority_is_that_of_torchrl():
     ours, theirs = TreeSampler(4, 1.0, 0.4), PrioritizedSampler(4, 1.0, 0.4)
     # Of equal priorities the first.
@@ -244,15 +237,6 @@ def test_fresh_rows_do_not_hand_on_their_priority():
     assert buffer.sampler.default_priority == 0.5
     buffer.extend(make_transitions(1))
     assert buffer.sampler.priorities()[7] == 0.5
-
-
-def test_an_outlier_that_is_overwritten_is_forgotten():
-    buffer = make_plain(4)
-    buffer.extend(make_transitions(4))
-    update(buffer, [0, 1], [20.0, 3.0])
-    buffer.extend(make_transitions(1))  # Takes the slot of the outlier, and its priority.
-    assert buffer.sampler.priorities()[0] == 20.0
-    assert buffer.sampler.default_priority == 3.0
 
 
 def test_the_highest_ever_is_an_option_and_stays():

@@ -50,20 +50,6 @@ def is_fresh(storage, slots):
     return rows[:, learned].isnan().all() and (rows[:, table.count_column] == 0).all()
 
 
-def test_a_wrap_of_the_ring_resets_exactly_the_rows_it_writes(make_storage):
-    storage = make_storage(8)
-    buffer = make_buffer(8, storage=storage)
-    buffer.extend(make_transitions(6))
-    fill_signals(storage)
-    index = buffer.extend(make_transitions(5, seed=1, first=6))
-    assert index.tolist() == [6, 7, 0, 1, 2]
-    assert is_fresh(storage, index)
-    assert column(storage, "td_error")[3:6].tolist() == [7.0] * 3
-    rewards = storage[:]["next", "reward"].squeeze(1)
-    torch.testing.assert_close(storage.signal_table.rewards.float(), rewards)
-    torch.testing.assert_close(column(storage, "reward").float(), rewards.abs())
-
-
 @pytest.mark.parametrize(
     ("cursor", "slots"),
     [
@@ -101,20 +87,6 @@ def test_write_outside_of_the_storage_adds_no_rows(make_storage):
         with pytest.raises(IndexError, match="out of"):
             storage.set(torch.tensor([7, 8]), data)
     assert len(storage) == 2
-
-
-def test_a_batch_larger_than_the_storage_leaves_signals_of_the_rows_that_stay(make_storage):
-    storage = make_storage(4)
-    buffer = make_buffer(4, storage=storage)
-    buffer.extend(make_transitions(11))
-    assert len(buffer) == 4
-    assert storage.signal_table.size == 4
-    torch.testing.assert_close(
-        storage.signal_table.rewards.float(), storage[:]["next", "reward"].squeeze(1)
-    )
-    batch = buffer.sample()
-    buffer.update_tensordict_priority(write_signals(batch))
-    assert buffer.stale_updates == 0
 
 
 def test_a_writer_that_keeps_the_best_keeps_signals_and_data_together():
@@ -187,21 +159,6 @@ def test_entries_that_are_no_tensors_come_back(kind):
     assert found.batch_size == (2,)
     assert found["world"] == ["A", "A"]
     assert found["observation"].squeeze(1).tolist() == [2.0, 0.0]
-
-
-def test_an_emptied_buffer_forgets_the_signals_and_can_be_filled_again(make_storage):
-    storage = make_storage(8)
-    buffer = make_filled(8, storage=storage)
-    buffer.update_tensordict_priority(write_signals(buffer.sample()))
-    buffer.empty()
-    assert len(buffer) == storage.signal_table.size == 0
-    assert storage.signal_table.rewards.numel() == 0
-    assert buffer.sampler.default_priority == 1.0
-    assert buffer.sampler.weights == {}
-    buffer.extend(make_transitions(3, seed=9))
-    assert is_fresh(storage, [0, 1, 2])
-    assert storage.signal_table.size == 3
-    assert buffer.sample()["index"].max() < 3
 
 
 def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
