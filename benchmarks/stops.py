@@ -37,7 +37,7 @@ from torchrl_mpfa import SignalReplayBuffer
 from torchrl_mpfa.saving import load_safely
 from training import figures, files
 from training.records import read_table, write_table
-from training.run import checkpoints, loop, script, showing
+from training.run import checkpoints, loop, script, tracking
 from training.run.loop import TrainingRun
 from training.run.schedule import Schedule
 
@@ -93,7 +93,7 @@ def watch(seen: memoryview, pipe: int) -> None:
     in_phase("evaluation", TrainingRun, "_evaluate")
     in_phase("checkpoint", checkpoints, "save")
     in_phase("checkpoint", loop, "save")
-    in_phase("pictures", showing, "show_policy")
+    in_phase("pictures", tracking, "show_policy")
     in_phase("charts", figures, "plot_learning_curve")
     in_phase("charts", charts, "plot_histograms")
 

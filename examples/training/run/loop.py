@@ -27,7 +27,7 @@ from training.environments import vector_of
 from training.evaluating import Drives
 from training.files import no_room
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run import showing
+from training.run import tracking
 from training.run.assembly import make_curiosity, make_learner, method_of
 from training.run.checkpoints import (
     Checkpoints,
@@ -42,7 +42,6 @@ from training.run.evaluations import evaluate_policy
 from training.run.exploration import make_explorer
 from training.run.hooks import Hook, Progress
 from training.run.schedule import Schedule
-from training.run.tracking import Tracker
 from training.run.updates import UpdateLog
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
@@ -109,8 +108,8 @@ class TrainingRun:
         self._before = self.actions
         """Actions before the last iteration."""
         run_id = None if state is None else state["wandb"]
-        self.tracker = Tracker(settings, folder, run_id=run_id, actions=self.actions)
-        self.hooks = [self.tracker, Checkpoints(), showing.Pictures(), Progress(), *hooks]
+        self.tracker = tracking.Tracker(settings, folder, run_id=run_id, actions=self.actions)
+        self.hooks = [self.tracker, Checkpoints(), tracking.Pictures(), Progress(), *hooks]
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
@@ -209,7 +208,7 @@ class TrainingRun:
         # Only now: a run that a hook ends resumes as if it had been stopped.
         self._call(*self._events)
         if self.crossed(self.settings.tracking.pictures_every or 0):
-            showing.show_policy(self)
+            tracking.show_policy(self)
         # Last: a run that an error ends before here begins the stage when it resumes.
         self._advance()
         self._anneal()

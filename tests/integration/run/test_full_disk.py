@@ -20,7 +20,7 @@ from torchrl.record.loggers.csv import CSVExperiment
 from tests.integration.tiny_runs import OVERRIDES
 from training import figures, files
 from training.pictures import write_pictures
-from training.run import showing
+from training.run import tracking
 from training.run.checkpoints import save
 from training.run.hooks import Hook
 from training.run.loggers import forget_after
@@ -135,7 +135,7 @@ def test_pictures_without_room_end_a_run_before_it_is_finished(
         write_pictures(*arguments, **options)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1500, resource.RLIM_INFINITY))
 
-    monkeypatch.setattr(showing, "write_pictures", write)
+    monkeypatch.setattr(tracking, "write_pictures", write)
     words = ("tracking=[tensorboard]", "tracking.pictures_every=0", "evaluation.episodes=2")
     assert begun(tmp_path, *words, *CSV[1:]) == 1
     assert len(printed()) == 1

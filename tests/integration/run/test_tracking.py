@@ -19,11 +19,10 @@ from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.finished import is_finished
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run import showing
+from training.run import tracking
 from training.run.checkpoints import save
 from training.run.loop import TrainingRun
-from training.run.showing import show_policy
-from training.run.tracking import Tracker
+from training.run.tracking import Tracker, show_policy
 from training.settings.command_line import composed
 from training.settings.train import (
     Stage,
@@ -239,7 +238,7 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
         show_policy(run)
         took.append((time.perf_counter() - begun[0], run.robots.elapsed() - begun[1]))
 
-    monkeypatch.setattr("training.run.showing.show_policy", show)
+    monkeypatch.setattr("training.run.tracking.show_policy", show)
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
@@ -299,9 +298,9 @@ def test_pictures_of_a_policy_that_needs_the_filter_are_made_behind_it(
     tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drivers: list[object] = []
-    drive = showing.drive
+    drive = tracking.drive
     monkeypatch.setattr(
-        showing, "drive", lambda driver, *a, **k: drivers.append(driver) or drive(driver, *a, **k)
+        tracking, "drive", lambda driver, *a, **k: drivers.append(driver) or drive(driver, *a, **k)
     )
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
@@ -333,7 +332,7 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     settings = tiny(episodes=[Stage("A", 2)])
     settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, pictures_every=every)
-    monkeypatch.setattr("training.run.showing.show_policy", lambda run: shown.append(run.actions))
+    monkeypatch.setattr("training.run.tracking.show_policy", lambda run: shown.append(run.actions))
     train(tmp_path / "run", settings)
     (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
     assert shown == [*(range(20, end, 20) if every else ()), end]
@@ -349,7 +348,7 @@ def test_pictures_that_were_interrupted_are_made_when_the_run_resumes(
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
     with monkeypatch.context() as patch:
-        patch.setattr("training.run.showing.show_policy", interrupted)
+        patch.setattr("training.run.tracking.show_policy", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train(tmp_path, settings)
     assert not is_finished(tmp_path)
