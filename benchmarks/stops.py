@@ -38,8 +38,7 @@ from torchrl_mpfa.saving import load_safely
 from training import figures, files
 from training.records import read_table, write_table
 from training.run import checkpoints, loop, script, tracking
-from training.run.loop import TrainingRun
-from training.run.schedule import Schedule
+from training.run.loop import Schedule, TrainingRun
 
 ROWS = Path(__file__).parents[1] / "docs/results/stops.csv"
 SETTINGS = [

@@ -277,7 +277,8 @@ def critic(options: argparse.Namespace) -> Values | None:
     """Return the values of the critic of a run, if there is a run."""
     if options.path is None or not (options.path / files.CHECKPOINT).exists():
         return None
-    from training.run.values import load_learner, values_of
+    from training.run.checkpoints import load_learner
+    from training.run.evaluations import values_of
 
     try:
         learner, settings = load_learner(options.path, options.loaded)

@@ -20,7 +20,7 @@ from torchrl.envs.utils import step_mdp
 
 from benchmarks.speed.timing import MICROSECONDS, few_threads
 from benchmarks.speed.training import TRANSITION, Agent, IdleTorchEnv
-from training.run.compiling import has_compiler
+from training.run.assembly import has_compiler
 
 PARTS = ("policy and noise", "environment", "write", "sample", "update", "priorities")
 

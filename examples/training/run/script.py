@@ -27,9 +27,8 @@ from training.finished import after_the_end, is_finished, nothing_learned
 from training.inherited import forget_single_run
 from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
-from training.run.assembly import method_of
+from training.run.assembly import method_of, prepare_compiler
 from training.run.checkpoints import read_checkpoint
-from training.run.compiling import prepare_compiler
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings

@@ -25,10 +25,9 @@ from training.inherited import with_environment
 from training.pictures import EPISODE, TRAJECTORIES, VALUES, trajectories_of, write_pictures
 from training.records import EpisodeRecord, EvaluationRecord, as_table
 from training.run.checkpoints import read_checkpoint
-from training.run.evaluations import SEED, kept_policy
+from training.run.evaluations import SEED, kept_policy, values_of
 from training.run.hooks import Hook
 from training.run.loggers import CSVLog, Log, TensorboardLog, WandbLog
-from training.run.values import values_of
 from training.settings.rules import settings_by_name
 from training.settings.train import TrackingSettings, TrainSettings, as_settings
 

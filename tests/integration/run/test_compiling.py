@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from training.run import compiling
-from training.run.compiling import is_compiled
+from training.run import assembly
+from training.run.assembly import is_compiled
 from training.settings.command_line import composed
 from training.settings.train import register
 
@@ -28,7 +28,7 @@ from training.settings.train import register
 def test_a_run_is_compiled_by_its_settings_and_length(
     arguments: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compiling, "has_compiler", lambda: True)
+    monkeypatch.setattr(assembly, "has_compiler", lambda: True)
     register()
     (settings,) = composed(["environment.physics=kinematic", *arguments.split()])
     assert is_compiled(settings) == compiled
