@@ -62,8 +62,7 @@ from training.evaluating import (
 )
 from training.finished import warnings_of
 from training.plugins import add_plugin
-from training.understood import understood
-from training.worlds import parse_worlds, world_name
+from training.worlds import parse_worlds, understood, world_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -294,7 +293,7 @@ def show_live(
     """Show the episodes in a window, one after another; return how each ended."""
     import pandas as pd
 
-    from training.live import watch
+    from training.pictures import watch
 
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)

@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from torchrl.trainers import Trainer
 
 from torchrl_trainer import close_progress_bar, report, silence
-from training.settings.from_file import quoted
+from training.settings.command_line import quoted
 
 
 def train(config: DictConfig) -> Trainer:

@@ -15,8 +15,7 @@ from optuna.distributions import (
 
 from torchrl_mpfa.checks import unknown
 from training.comparison.arms import with_defaults
-from training.settings.command_line import composed, parse_overrides
-from training.settings.from_file import as_text, read_names
+from training.settings.command_line import as_text, composed, parse_overrides, read_names
 from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test

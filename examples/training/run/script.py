@@ -32,11 +32,10 @@ from training.run.checkpoints import read_checkpoint
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
-from training.settings.command_line import composed, parse_overrides
-from training.settings.from_file import with_lines
+from training.settings.command_line import composed, parse_overrides, with_lines
 from training.settings.resuming import changed, check_lawful, check_single
 from training.settings.train import TrainSettings, as_settings, plain_settings, register
-from training.understood import understood
+from training.worlds import understood
 
 WRONG = 2
 """Exit status of a command line that cannot be."""
