@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,8 @@ DEFAULTS = ("tracking=off", "evaluation.every=5000")
 """Settings of a comparison unless its command line has others."""
 _OF_THE_COMPARISON = ("learner", "method", "seed", "run_dir", "overwrite", "resume")
 """Settings that a comparison gives each of its runs."""
+_COMMA = re.compile(r""",(?![^\[]*\]|[^{]*\}|[^']*'(?:[^']*'[^']*')*[^']*$)""")
+"""A comma between two settings: no bracket that was opened before it closes after it, no quote."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,9 @@ class Arm:
 
     def over(self, overrides: Sequence[str]) -> list[str]:
         """The settings of a comparison with those of the arm in the place of the same ones."""
-        own = [_key(setting) for setting in self.settings]
         # The whole of a group takes the place of each setting in it.
-        kept = [o for o in overrides if not any(f"{_key(o)}.".startswith(f"{k}.") for k in own)]
+        replaced = tuple(f"{_key(setting)}." for setting in self.settings)
+        kept = [text for text in overrides if not f"{_key(text)}.".startswith(replaced)]
         return [*kept, *self.settings]
 
 
@@ -60,7 +63,7 @@ def parse_arm(text: str) -> Arm:
     allowed, wanted = NAME
     if not colon or not allowed(name):
         raise ValueError(f"must be NAME:SETTING=VALUE,... with a NAME of {wanted}")
-    settings = tuple(_split(listed)) if listed.strip() else ()
+    settings = tuple(part.strip() for part in _COMMA.split(listed)) if listed.strip() else ()
     check_free(settings)
     return Arm(name, settings)
 
@@ -84,17 +87,3 @@ def with_defaults(overrides: Sequence[str]) -> list[str]:
 
 def _key(setting: str) -> str:
     return setting.partition("=")[0]
-
-
-def _split(text: str) -> list[str]:
-    """Parts between the commas that are in no brackets and no quotes."""
-    parts, depth, quote = [""], 0, ""
-    for sign in text:
-        if quote or sign in "'\"":
-            quote = "" if sign == quote else quote or sign
-        depth += 0 if quote else (sign in "[{(") - (sign in ")}]")
-        if sign == "," and depth == 0 and not quote:
-            parts.append("")
-        else:
-            parts[-1] += sign
-    return [part.strip() for part in parts]
