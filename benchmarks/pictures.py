@@ -47,9 +47,9 @@ from training.evaluating import Drivable, drive, filtered
 from training.files import run_script
 from training.pictures import Values, longest, trajectories_of
 from training.records import read_table
-from training.run.checkpoints import read_checkpoint
-from training.run.history import ReplayHistory
-from training.run.values import load_learner, values_of
+from training.run.checkpoints import load_learner, read_checkpoint
+from training.run.evaluations import values_of
+from training.run.updates import ReplayHistory
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = "td3-rooms"

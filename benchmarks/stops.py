@@ -37,9 +37,8 @@ from torchrl_mpfa import SignalReplayBuffer
 from torchrl_mpfa.saving import load_safely
 from training import figures, files
 from training.records import read_table, write_table
-from training.run import checkpoints, loop, script, showing
-from training.run.loop import TrainingRun
-from training.run.schedule import Schedule
+from training.run import checkpoints, loop, script, tracking
+from training.run.loop import Schedule, TrainingRun
 
 ROWS = Path(__file__).parents[1] / "docs/results/stops.csv"
 SETTINGS = [
@@ -93,7 +92,7 @@ def watch(seen: memoryview, pipe: int) -> None:
     in_phase("evaluation", TrainingRun, "_evaluate")
     in_phase("checkpoint", checkpoints, "save")
     in_phase("checkpoint", loop, "save")
-    in_phase("pictures", showing, "show_policy")
+    in_phase("pictures", tracking, "show_policy")
     in_phase("charts", figures, "plot_learning_curve")
     in_phase("charts", charts, "plot_histograms")
 

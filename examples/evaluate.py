@@ -62,8 +62,7 @@ from training.evaluating import (
 )
 from training.finished import warnings_of
 from training.plugins import add_plugin
-from training.understood import understood
-from training.worlds import parse_worlds, world_name
+from training.worlds import parse_worlds, understood, world_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -277,7 +276,8 @@ def critic(options: argparse.Namespace) -> Values | None:
     """Return the values of the critic of a run, if there is a run."""
     if options.path is None or not (options.path / files.CHECKPOINT).exists():
         return None
-    from training.run.values import load_learner, values_of
+    from training.run.checkpoints import load_learner
+    from training.run.evaluations import values_of
 
     try:
         learner, settings = load_learner(options.path, options.loaded)
@@ -293,7 +293,7 @@ def show_live(
     """Show the episodes in a window, one after another; return how each ended."""
     import pandas as pd
 
-    from training.live import watch
+    from training.pictures import watch
 
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)

@@ -1,10 +1,8 @@
 """The replay parts in TorchRL's own ``DDPGTrainer``, on the navigation task. Runs in seconds.
 
-    python examples/torchrl_trainer.py
-    python examples/torchrl_trainer.py --frames 20000 --seed 1
-    python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, new worlds
-
-``torchrl_config.py`` makes the same of Hydra's files.
+python examples/torchrl_trainer.py
+python examples/torchrl_trainer.py --frames 20000 --seed 1
+python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, new worlds
 """
 
 from __future__ import annotations
@@ -28,7 +26,6 @@ from mpfa_envs import make_navigation_env
 from torchrl_mpfa import (
     MPFASampler,
     SignalReplayBuffer,
-    SignalSampler,
     SignalTensorStorage,
     make_actor,
     make_critic,
@@ -104,22 +101,18 @@ def make_trainer(
 
 def report(trainer: Trainer) -> list[str]:
     """Report frames, steps, updates of priorities, and shares in the priorities, line by line."""
-    buffer, stepper = trainer.replay_buffer, trainer.optimization_stepper
-    lines = [
+    buffer, statistics = trainer.replay_buffer, trainer.replay_buffer.stats()
+    return [
         f"frames collected        {trainer.collected_frames}",
         f"transitions in replay   {len(buffer)}, sampled by {type(buffer.sampler).__name__}",
         f"steps of the optimizer  {trainer._optim_count}",
-    ]
-    if isinstance(stepper, PriorityStepper):
-        lines.append(f"updates of priorities   {stepper.priority_updates}")
-    if isinstance(buffer.sampler, SignalSampler):
-        statistics = buffer.stats()
-        lines += [
+        f"updates of priorities   {trainer.optimization_stepper.priority_updates}",
+        *(
             f"signal {name:16} weight {weight:.3f}, share of the priority "
             f"{statistics[f'share/{name}']:.3f}"
             for name, weight in buffer.sampler.weights.items()
-        ]
-    return lines
+        ),
+    ]
 
 
 def silence() -> None:

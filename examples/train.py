@@ -33,7 +33,7 @@ def main() -> None:
     """Check the command line, then train."""
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
-        from training.settings.help import help_text
+        from training.settings.command_line import help_text
 
         try:
             print(help_text(__doc__ or "", arguments))

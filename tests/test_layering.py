@@ -156,7 +156,7 @@ MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_ms
             {"pybullet", "pybullet_utils"},
             {"benchmarks/speed/bullet_world.py", "envs/mpfa_envs/robots/simulation.py"},
         ),
-        ({"wandb"}, {"examples/training/run/wandb_log.py"}),
+        ({"wandb"}, {"examples/training/run/loggers.py"}),
         (
             {"optuna"},
             {"examples/training/comparison/ranges.py", "examples/training/comparison/search.py"},

@@ -41,7 +41,7 @@ from torchrl_mpfa import (
     make_actor,
     make_critic,
 )
-from training.run.compiling import has_compiler
+from training.run.assembly import has_compiler
 
 WIDTH = 256
 CAPACITY = 100_000

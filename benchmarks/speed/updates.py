@@ -26,7 +26,7 @@ from benchmarks.speed.timing import (
 )
 from benchmarks.speed.training import Agent, make_loop
 from torchrl_mpfa import run_updates
-from training.run.compiling import has_compiler
+from training.run.assembly import has_compiler
 
 CASES = {
     **{f"update_{kind}_{width}": (kind, width) for kind in ("ddpg", "td3") for width in (64, 256)},

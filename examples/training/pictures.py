@@ -1,13 +1,13 @@
-"""The pictures of an evaluation: paths in up to nine worlds, Q over one, an episode in it."""
+"""What an evaluation shows: paths in up to nine worlds, Q over one, an episode, or a window."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from mpfa_envs import Policy, World, WorldTask
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.render import (
+    drive_episode,
     film_episode,
     render_trajectories,
     render_values,
@@ -109,3 +110,47 @@ def values_over(policy: Policy, task: WorldTask, values: Values | None) -> NDArr
         size=640,
         **policy.env_arguments,
     )
+
+
+_PAUSE = 1.0
+"""For which the end of an episode is shown [s]."""
+_OUTCOMES = ("success", "collision", "timeout")
+
+
+class Watched(NamedTuple):
+    """The end of an episode that was watched to its end."""
+
+    world: str
+    outcome: str
+    time_s: float
+
+
+def watch(
+    policy: Drivable, tasks: Sequence[WorldTask], *, speed: float = 1.0, **env_arguments: Any
+) -> Iterator[Watched]:
+    """Drive tasks one after another in a window, until it is closed.
+
+    The key N starts the next task, Escape ends.
+    """
+    # Only here, as it needs pygame, an extra of its own.
+    from mpfa_envs.scene.window import Window
+
+    window: Window | None = None
+    for number, task in enumerate(tasks):
+        for step in drive_episode(policy, task, seed=number, **env_arguments):
+            env = step.env
+            if window is None:
+                fps = speed / (env.config.time_step * env.config.action_repeat)
+                window = Window("N: next task   Escape: end", fps=fps)
+            (picture,) = env.render() or ()
+            if not window.show(picture) or "n" in window.pressed:
+                break
+            if step.wheels is None:
+                outcome = next(name for name in _OUTCOMES if step.info[name][0])
+                yield Watched(task.world.name, outcome, float(step.info["sim_time"][0]))
+                for _ in range(round(_PAUSE / (env.config.time_step * env.config.action_repeat))):
+                    window.show(picture)
+        if window is not None and window.closed:
+            break
+    if window is not None:
+        window.close()

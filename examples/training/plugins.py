@@ -30,10 +30,10 @@ def load_plugin(path: str | Path) -> str:
     if not os.path.isfile(file) or file.suffix != ".py":
         raise ValueError(f"plugin must be a Python file, got {path}")
     # By its name, as processes of Ray look for what it defines.
-    there, known = sys.modules.get(file.stem), digest(file)
-    if there is not None and getattr(there, "PLUGIN", None) == known:
+    loaded, sha256 = sys.modules.get(file.stem), digest(file)
+    if loaded is not None and getattr(loaded, "PLUGIN", None) == sha256:
         return str(file)
-    if there is not None and Path(getattr(there, "__file__", None) or "").resolve() != file:
+    if loaded is not None and Path(getattr(loaded, "__file__", None) or "").resolve() != file:
         raise ValueError(f"plugin must have a name that no module has, got {path}")
     spec = spec_from_file_location(file.stem, file)
     assert spec is not None and spec.loader is not None
@@ -45,13 +45,13 @@ def load_plugin(path: str | Path) -> str:
     except Exception as error:
         del sys.modules[file.stem]
         lines = [
-            each.lineno
-            for each in traceback.extract_tb(error.__traceback__)
-            if each.filename == str(file)
+            frame.lineno
+            for frame in traceback.extract_tb(error.__traceback__)
+            if frame.filename == str(file)
         ]
         where = f"{path}:{lines[-1]}" if lines else str(path)
         raise ValueError(f"plugin {where}: {type(error).__name__}: {error}") from error
-    module.PLUGIN = known  # type: ignore[attr-defined]
+    module.PLUGIN = sha256  # type: ignore[attr-defined]
     return str(file)
 
 
@@ -103,15 +103,14 @@ def with_plugin(
     Returns:
         The settings, and the plugin's absolute path, which they have.
     """
-    words = list(arguments)
-    for place in [n for n, word in enumerate(words[:-1]) if word == "--plugin"][::-1]:
-        words[place : place + 2] = [f"{_WORD}{words[place + 1]}"]
-    words = [word.removeprefix("--") if word.startswith(f"--{_WORD}") else word for word in words]
-    named = [word.removeprefix(_WORD) for word in plugin_words(words)] + [plugin] * bool(plugin)
-    if not named:
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--plugin", action="append", default=[plugin] if plugin else [])
+    options, words = parser.parse_known_args(arguments)
+    named = [word.removeprefix(_WORD) for word in plugin_words(words)]
+    paths = {load_plugin(file) for file in [*options.plugin, *named]}
+    if not paths:
         return words, None
-    paths = {load_plugin(each) for each in named if each is not None}
     if len(paths) > 1:
         raise ValueError(f"plugin must be one file, got {' and '.join(sorted(paths))}")
-    path = paths.pop()
+    (path,) = paths
     return [*(word for word in words if not word.startswith(_WORD)), f"{_WORD}{path}"], path

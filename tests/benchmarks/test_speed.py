@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.speed import __main__ as run
 from benchmarks.speed import (
     disk,
     method_steps,
+    profile,
     replay,
-    run,
     sbx_peer,
     start,
     timing,
@@ -75,31 +76,43 @@ def test_the_run_prints_a_table_and_writes_what_it_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "latest.json"
-    assert run.main(["--quick", "--only", "loss", "--output", str(path)]) == 0
+    assert run.main(["--quick", "--only", "extend_16", "--output", str(path)]) == 0
     entries = json.loads(path.read_text(encoding="utf-8"))
     check_schema(entries)
-    assert [found["name"] for found in entries] == ["loss_torchrl", "loss"]
+    assert [found["name"] for found in entries] == ["extend_16_torchrl", "extend_16"]
     assert [file.name for file in tmp_path.iterdir()] == ["latest.json"]
     table = capsys.readouterr().out.splitlines()
-    assert sum("loss_torchrl" in line for line in table) == 2  # Its row, and the baseline of ours.
+    assert sum("extend_16_torchrl" in line for line in table) == 2
 
 
 def test_check_fails_if_a_ratio_is_above_its_target(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ratio = run.TARGETS["loss"]
+    ratio = run.TARGETS["extend_16"]
 
     def measure(*, quick: bool) -> list[Entry]:
-        return [entry("loss", 1.0, "us", ratio=ratio, baseline="other")]
+        return [entry("extend_16", 1.0, "us", ratio=ratio, baseline="other")]
 
-    monkeypatch.setattr(run, "BENCHMARKS", {"loss": measure})
+    monkeypatch.setattr(run, "BENCHMARKS", {"extend_16": measure})
     arguments = ["--check", "--output", str(tmp_path / "latest.json")]
     assert run.main(arguments) == 0
     ratio += 0.01
     assert run.main(arguments) == 1
     assert run.main(arguments[1:]) == 0
-    sentence = f"loss: ratio {ratio:.2f} is above its target {run.TARGETS['loss']}"
+    sentence = f"extend_16: ratio {ratio:.2f} is above its target {run.TARGETS['extend_16']}"
     assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["step", "replay"])
+def test_profile_is_a_table_whose_parts_take_time(
+    what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(profile, "has_compiler", lambda: False)
+    profile.main([what, "--calls", "3"])
+    head, line, *rows = (row.split(" | ") for row in capsys.readouterr().out.splitlines())
+    parts = profile.STEP if what == "step" else profile.SAMPLE | profile.UPDATE
+    assert {*parts} <= {row[0].removeprefix("| ") for row in rows}
+    assert {len(head), len(line)} == {len(row) for row in rows} == {3}
 
 
 def test_every_target_belongs_to_a_benchmark() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.speed.convex import convex_parts
+from benchmarks.speed.bullet_world import convex_parts
 from mpfa_envs import Polygon, World
 from tests.envs.shapes import distance, inside
 

@@ -14,8 +14,7 @@ import export
 import report
 import tune
 from mpfa_envs import RobotNoise
-from training.comparison.arms import Arm
-from training.comparison.jobs import Job
+from training.comparison.jobs import Arm, Job
 from training.evaluating import evaluation_folder
 from training.files import check_folder, full_disk, run_script, short_name
 from training.settings.train import _one_folder

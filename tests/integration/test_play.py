@@ -15,8 +15,8 @@ from mpfa_envs import Policy, world_tasks
 from mpfa_envs.policies.layers import Linear
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import RIVAL, ROBOT
-from training import live
-from training.live import watch
+from training import pictures
+from training.pictures import watch
 
 pygame = pytest.importorskip("pygame")
 
@@ -119,7 +119,7 @@ def test_the_evaluation_is_shown_live_and_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        live, "watch", lambda policy, tasks, **how: watch(policy, tasks, speed=100.0, **how)
+        pictures, "watch", lambda policy, tasks, **how: watch(policy, tasks, speed=100.0, **how)
     )
     monkeypatch.setattr(evaluate, "load_policy", lambda path: constant(-1.0, -1.0))
     words = ["--worlds", "A", "--episodes", "1", "--live", "--output", str(tmp_path / "out")]

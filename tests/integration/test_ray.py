@@ -20,7 +20,7 @@ from torchrl_mpfa.integrations.ray import (
 )
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods import make_replay as make_local_replay
-from training.run.history import ReplayHistory
+from training.run.updates import ReplayHistory
 
 CAPACITY = 64
 

@@ -14,7 +14,7 @@ from tests.integration.run.test_runs import begin
 from training import extra, files
 from training.comparison.search import best_of, equals_of
 from training.finished import warnings_of
-from training.understood import narrowest_door, understood
+from training.worlds import narrowest_door, understood
 
 
 def parted(door: float, size: tuple[float, float] = (12.0, 8.0)) -> World:

@@ -14,9 +14,8 @@ from optuna.distributions import (
 )
 
 from torchrl_mpfa.checks import unknown
-from training.comparison.arms import with_defaults
-from training.settings.command_line import composed, parse_overrides
-from training.settings.from_file import as_text, read_names
+from training.comparison.jobs import check_free, with_defaults
+from training.settings.command_line import as_text, composed, parse_overrides, read_names
 from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test
@@ -42,12 +41,7 @@ Ranges = Mapping[str, BaseDistribution]
 
 def fixed_settings(settings: Sequence[str]) -> TrainSettings:
     """Return the settings of all trials, checked, with the defaults of a search."""
-    for text in settings:
-        if text.startswith("-") or "=" not in text:
-            raise ValueError(f"{text!r} is not NAME=VALUE")
-    for override in parse_overrides(settings):
-        if override.key_or_group in OF_THE_SEARCH:
-            raise ValueError(f"{override.key_or_group} is what the search gives each run")
+    check_free(settings, OF_THE_SEARCH, by="search")
     first, *others = composed(with_defaults(settings))
     if others:
         raise ValueError("a search takes one value for each setting, ranges are in its file")
@@ -98,12 +92,12 @@ def _corners(ranges: Ranges) -> Iterator[dict[str, Any]]:
         yield {name: each[min(number, len(each) - 1)] for name, each in ends.items()}
 
 
-def _ends(found: BaseDistribution) -> Sequence[Any]:
+def _ends(values: BaseDistribution) -> Sequence[Any]:
     """Return the ends of a range of numbers, or all choices."""
-    if isinstance(found, IntDistribution | FloatDistribution):
-        return found.low, found.high
-    assert isinstance(found, CategoricalDistribution)
-    return found.choices
+    if isinstance(values, IntDistribution | FloatDistribution):
+        return values.low, values.high
+    assert isinstance(values, CategoricalDistribution)
+    return values.choices
 
 
 def _range(name: str, written: Any, fixed: Mapping[str, Any]) -> BaseDistribution:

@@ -25,9 +25,8 @@ from tqdm import tqdm
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.arms import Arm
 from training.comparison.execution import LOG, Commands, Work, workers_of
-from training.comparison.jobs import Job
+from training.comparison.jobs import Arm, Job
 from training.comparison.options import JOBS
 from training.comparison.ranges import Ranges, as_lines, fixed_settings
 from training.comparison.workers import Worker
@@ -109,15 +108,18 @@ class Trial:
         reported: int = 0,
     ) -> None:
         self.trial, self.plan = trial, plan
-        own = dict(line.split("=", 1) for line in (*plan.settings, *as_lines(values)))
-        learner = own.pop("learner", plan.fixed.learner.name)
-        method = own.pop("method", plan.fixed.method.name)
         # An evaluation is known once it is saved.
-        own["checkpoint_every"] = str(plan.fixed.evaluation.every)
-        arm = Arm("", tuple(f"{name}={text}" for name, text in own.items()))
+        saves = f"checkpoint_every={plan.fixed.evaluation.every}"
+        lines = (*plan.settings, *as_lines(values), saves)
+        texts = dict(line.split("=", 1) for line in lines)
+        learner = texts.pop("learner", plan.fixed.learner.name)
+        method = texts.pop("method", plan.fixed.method.name)
+        arm = Arm(settings=tuple(f"{name}={text}" for name, text in texts.items()))
         self.path = folder / f"trial-{trial.number:04}"
         self.jobs = [Job(learner, method, seed, self.path, arm) for seed in plan.seeds]
-        self._known, self._seen = reported, max(reported - 1, 0)
+        self._reported = reported
+        # Whether to prune after the last one may not have been asked any more.
+        self._judged = max(reported - 1, 0)
 
     @property
     def left(self) -> Job | None:
@@ -135,9 +137,9 @@ class Trial:
 
     def is_hopeless(self) -> bool:
         """Report new evaluations; return True to prune the trial."""
-        for step in range(self._seen + 1, sum(map(len, self.curves())) + 1):
-            self._seen = step
-            if step > self._known:
+        for step in range(self._judged + 1, sum(map(len, self.curves())) + 1):
+            self._judged = step
+            if step > self._reported:
                 self.trial.report(self.plan.score(self.curves(step)), step)
             # A trial at its end has cost all that it can.
             if step != self.plan.evaluations and self.trial.should_prune():

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mpfa_envs import save_policy
+from mpfa_envs import Policy, save_policy
 from torchrl_mpfa import Learner
 from torchrl_mpfa.saving import load_safely, save_atomically
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord, as_table, write_table
+from training.run.assembly import make_learner, method_of
 from training.run.evaluations import kept_policy
 from training.run.hooks import Hook
+from training.settings.train import TrainSettings, as_settings
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
@@ -69,6 +71,29 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     if found != FORMAT:
         raise ValueError(f"{file} has format {found}, this version reads {FORMAT}")
     return dict(state)
+
+
+def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:
+    """Read the learner of a run, with its critic.
+
+    Args:
+        folder: Of the run, with its checkpoint.
+        policy: That of the run.
+
+    Returns:
+        The learner, which is not compiled, and the settings of the run.
+
+    Raises:
+        FileNotFoundError: If there is no checkpoint.
+        ValueError: If it is damaged, of another version, or its learner is of another policy.
+    """
+    state = read_checkpoint(folder)
+    settings = as_settings(state["settings"])
+    settings.device = "cpu"
+    sizes = policy.observation_size, policy.action_size
+    learner = make_learner(settings.learner, method_of(settings), *sizes)
+    learner.load_state_dict(state["learner"])
+    return learner, settings
 
 
 def state_of(run: TrainingRun) -> dict[str, Any]:

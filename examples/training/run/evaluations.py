@@ -1,4 +1,4 @@
-"""The evaluations of a run: its policy as a function of its own, driven through fixed tasks."""
+"""The policy of a run as a function of its own, its evaluations in fixed tasks, and its values."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import time
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from mpfa_envs import Policy, RobotModel, WorldTask, world_tasks
 from mpfa_envs.robots.resolve import resolve_robot
+from torchrl_mpfa import ActorCritic, Learner
 from training.environments import env_arguments
 from training.evaluating import Drives, as_trained, drive_together
+from training.pictures import Values
 from training.records import EvaluationRecord, last_best
 from training.run.assembly import policy_layers
 from training.settings.learners import is_discrete
@@ -97,3 +103,30 @@ def evaluate_policy(
 def _tasks(world: str, episodes: int, robot: RobotModel) -> list[WorldTask]:
     """The tasks of each evaluation, with worlds whose shortest paths are known from the second."""
     return world_tasks(world, episodes=episodes, seed=SEED, robot=robot)
+
+
+def values_of(learner: Learner, policy: Policy, settings: TrainSettings) -> Values:
+    """Return a function that values a policy's actions by the critics of a learner.
+
+    Args:
+        learner: The learner; its networks are used as they are when the values are asked for.
+        policy: Whose actions are valued; a learner without an actor values its own.
+        settings: Of the run.
+
+    Returns:
+        The values, in units of the reward.
+    """
+    device = settings.device
+    scale = settings.learner.reward_scale
+
+    def values(observations: NDArray[np.float32]) -> NDArray[np.float64]:
+        inputs = {"observation": torch.as_tensor(observations, device=device)}
+        with torch.no_grad():
+            if isinstance(learner, ActorCritic):
+                inputs["action"] = torch.as_tensor(policy(observations), device=device)
+                best = learner.values_of(TensorDict(inputs, [len(observations)])).amin(0)
+            else:
+                best = learner.policy.outputs(inputs)["chosen_action_value"].squeeze(-1)
+        return best.double().cpu().numpy() / scale
+
+    return values

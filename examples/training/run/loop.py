@@ -1,4 +1,4 @@
-"""The training run: iterations of many robots at once, with checkpoints at any of them."""
+"""The training run: iterations of many robots at once, and its progress in its curriculum."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from training.environments import vector_of
 from training.evaluating import Drives
 from training.files import no_room
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run import showing
-from training.run.assembly import make_curiosity, make_learner, method_of
+from training.run import tracking
+from training.run.assembly import is_compiled, make_curiosity, make_learner, method_of
 from training.run.checkpoints import (
     Checkpoints,
     is_sound,
@@ -36,19 +36,93 @@ from training.run.checkpoints import (
     save,
     set_random_state,
 )
-from training.run.compiling import is_compiled
 from training.run.driving import Robots
 from training.run.evaluations import evaluate_policy
 from training.run.exploration import make_explorer
 from training.run.hooks import Hook, Progress
-from training.run.schedule import Schedule
-from training.run.tracking import Tracker
 from training.run.updates import UpdateLog
 from training.settings.learners import is_discrete
-from training.settings.train import TrainSettings
+from training.settings.train import Stage, TrainSettings
 
 _MANY_EPISODES = 500
 """From here on the learning rates fall linearly unless the settings say otherwise."""
+
+
+class Schedule:
+    """Counts the actions and the episodes of a run, and knows in which stage it is.
+
+    Args:
+        stages: The stages, all of which count episodes or all of which count actions.
+
+    Examples:
+        >>> schedule = Schedule([Stage("A", episodes=1), Stage("B", episodes=3)])
+        >>> schedule.count(actions=16, episodes=1)
+        >>> schedule.advance()
+        True
+        >>> schedule.world, schedule.fraction, schedule.finished
+        ('B', 0.25, False)
+    """
+
+    def __init__(self, stages: Sequence[Stage]) -> None:
+        self.stages = list(stages)
+        self.unit = "episode" if self.stages[0].episodes else "action"
+        self.total = sum(stage.length for stage in self.stages)
+        """Episodes or actions of all stages."""
+        self.stage = 0
+        """Number of the present stage."""
+        self.actions = 0
+        self.episodes = 0
+        self._in_stage = 0
+
+    @property
+    def world(self) -> str:
+        """World of the present stage."""
+        return self.stages[self.stage].world
+
+    @property
+    def done(self) -> int:
+        """Episodes or actions that count so far."""
+        before = sum(stage.length for stage in self.stages[: self.stage])
+        return min(before + self._in_stage, self.total)
+
+    @property
+    def fraction(self) -> float:
+        """Share of the run that is done, from 0 to 1."""
+        return self.done / self.total
+
+    @property
+    def finished(self) -> bool:
+        """True if all stages are over."""
+        return self.done == self.total
+
+    def count(self, *, actions: int, episodes: int) -> None:
+        """Count what an iteration brought."""
+        self.actions += actions
+        self.episodes += episodes
+        self._in_stage += episodes if self.unit == "episode" else actions
+
+    def advance(self) -> bool:
+        """Go to the next stage if the present one is over and not the last."""
+        is_last = self.stage == len(self.stages) - 1
+        if is_last or self._in_stage < self.stages[self.stage].length:
+            return False
+        # What ended beyond the stage's length, of several robots, is not carried over.
+        self.stage, self._in_stage = self.stage + 1, 0
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the progress of the run."""
+        return {
+            "stage": self.stage,
+            "in_stage": self._in_stage,
+            "actions": self.actions,
+            "episodes": self.episodes,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the progress of a run, which may have more stages now."""
+        self.stage, self._in_stage = state["stage"], state["in_stage"]
+        self.actions, self.episodes = state["actions"], state["episodes"]
 
 
 class TrainingRun:
@@ -109,8 +183,8 @@ class TrainingRun:
         self._before = self.actions
         """Actions before the last iteration."""
         run_id = None if state is None else state["wandb"]
-        self.tracker = Tracker(settings, folder, run_id=run_id, actions=self.actions)
-        self.hooks = [self.tracker, Checkpoints(), showing.Pictures(), Progress(), *hooks]
+        self.tracker = tracking.Tracker(settings, folder, run_id=run_id, actions=self.actions)
+        self.hooks = [self.tracker, Checkpoints(), tracking.Pictures(), Progress(), *hooks]
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
@@ -209,7 +283,7 @@ class TrainingRun:
         # Only now: a run that a hook ends resumes as if it had been stopped.
         self._call(*self._events)
         if self.crossed(self.settings.tracking.pictures_every or 0):
-            showing.show_policy(self)
+            tracking.show_policy(self)
         # Last: a run that an error ends before here begins the stage when it resumes.
         self._advance()
         self._anneal()

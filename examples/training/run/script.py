@@ -27,17 +27,15 @@ from training.finished import after_the_end, is_finished, nothing_learned
 from training.inherited import forget_single_run
 from training.plugins import with_plugin
 from training.records import EpisodeRecord, as_table
-from training.run.assembly import method_of
+from training.run.assembly import method_of, prepare_compiler
 from training.run.checkpoints import read_checkpoint
-from training.run.compiling import prepare_compiler
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
-from training.settings.command_line import composed, parse_overrides
-from training.settings.from_file import with_lines
+from training.settings.command_line import composed, parse_overrides, with_lines
 from training.settings.resuming import changed, check_lawful, check_single
 from training.settings.train import TrainSettings, as_settings, plain_settings, register
-from training.understood import understood
+from training.worlds import understood
 
 WRONG = 2
 """Exit status of a command line that cannot be."""

@@ -1,12 +1,14 @@
-"""The logs of a run: wandb, in ``wandb_log.py``, and TorchRL's loggers, in ``loggers.py``."""
+"""What of a run goes to its logs, and when: numbers, and pictures of its policy."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import shlex
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,19 +17,22 @@ import torch
 from PIL import Image
 from tensordict import TensorDictBase
 
+from mpfa_envs import save_policy
+from mpfa_envs.evaluation.results import EpisodeResult
 from training import files
+from training.evaluating import as_trained, drive
 from training.inherited import with_environment
-from training.pictures import trajectories_of
-from training.records import EpisodeRecord, EvaluationRecord
+from training.pictures import EPISODE, TRAJECTORIES, VALUES, trajectories_of, write_pictures
+from training.records import EpisodeRecord, EvaluationRecord, as_table
 from training.run.checkpoints import read_checkpoint
+from training.run.evaluations import SEED, kept_policy, values_of
 from training.run.hooks import Hook
-from training.run.loggers import CSVLog, Log, TensorboardLog
+from training.run.loggers import CSVLog, Log, TensorboardLog, WandbLog
 from training.settings.rules import settings_by_name
 from training.settings.train import TrackingSettings, TrainSettings, as_settings
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
-    from training.run.wandb_log import WandbLog
 
 
 _RATES = ("success", "collision", "timeout", "spl", "sct")
@@ -51,23 +56,28 @@ class Tracker(Hook):
     ) -> None:
         # A sweep has given its run an id.
         self.run_id = run_id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
-        wanted = with_environment(settings.tracking)
-        self._pictures = wanted.pictures_every is not None
-        self._logs: list[Log] = []
-        self.upload = upload_command(wanted, folder, self.run_id)
+        self._wanted = with_environment(settings.tracking)
+        self._settings, self._folder, self._actions = settings, folder, actions
+        self.upload = upload_command(self._wanted, folder, self.run_id)
         """Command that uploads the run to wandb, if it is kept offline."""
+        has_pictures = self._wanted.mode != "off" or self._wanted.tensorboard
+        self.shows = has_pictures and self._wanted.pictures_every is not None
+        """True if pictures are asked for, and there is a log for them."""
         self._wandb: WandbLog | None = None
-        if wanted.mode != "off":
-            # Imports wandb, which takes a second.
-            from training.run.wandb_log import WandbLog
-
+        self._logs: list[Log] = []
+        # Now, as wandb may reject the run; the files of the others once the run begins.
+        if self._wanted.mode != "off":
             self._wandb = WandbLog(settings, folder, run_id=self.run_id)
             self._logs.append(self._wandb)
-        if wanted.csv:
-            self._logs.append(CSVLog(folder, actions=actions))
-        if wanted.tensorboard:
-            named = dict(settings_by_name(settings))
-            self._logs.append(TensorboardLog(folder, actions=actions, settings=named))
+
+    def on_begin(self, run: TrainingRun) -> None:
+        """Open the files; those of an earlier run in the folder have been moved by now."""
+        if self._wanted.csv:
+            self._logs.append(CSVLog(self._folder, actions=self._actions))
+        if self._wanted.tensorboard:
+            settings = dict(settings_by_name(self._settings))
+            log = TensorboardLog(self._folder, actions=self._actions, settings=settings)
+            self._logs.append(log)
 
     def on_episode(self, run: TrainingRun, record: EpisodeRecord) -> None:
         """Log one episode."""
@@ -79,14 +89,14 @@ class Tracker(Hook):
         entries["train/path_length"] = record.path_length
         entries["train/episode"] = record.episode
         entries["time/steps_per_second"] = record.total_steps / max(record.seconds, 1e-9)
-        self._log(entries, record.total_steps)
+        self.log(entries, record.total_steps)
 
     def on_evaluation(self, run: TrainingRun, record: EvaluationRecord) -> None:
         """Log an evaluation, with a picture of its paths where a log can show it."""
         entries: dict[str, Any] = {f"evaluation/{name}": getattr(record, name) for name in _RATES}
         if self.shows and run.driven is not None:
             entries["evaluation/paths"] = trajectories_of([run.driven], size=_SMALL)
-        self._log(entries, record.total_steps)
+        self.log(entries, record.total_steps)
 
     def on_update(
         self, run: TrainingRun, losses: dict[str, torch.Tensor], batch: TensorDictBase
@@ -105,26 +115,17 @@ class Tracker(Hook):
             entries["priorities/importance_weight"] = batch["priority_weight"].detach().cpu()
             for name, value in batch["signals"].items():
                 entries[f"priorities/{name}"] = value.detach().cpu()
-        self._log(entries, run.actions)
+        self.log(entries, run.actions)
 
-    @property
-    def shows(self) -> bool:
-        """True if pictures are asked for, and there is a log for them."""
-        return self._pictures and any(not isinstance(log, CSVLog) for log in self._logs)
-
-    def log_policy(
-        self, entries: Mapping[str, Any], *, file: Path, card: Mapping[str, Any], actions: int
-    ) -> None:
-        """Log pictures and tables of what a policy does, and to wandb the policy."""
-        self._log(entries, actions)
-        if self._wandb is not None:
-            self._wandb.keep(file, card)
-        # What cannot be written is missed now, not after the run was reported as finished.
-        self.flush()
-
-    def _log(self, entries: Mapping[str, Any], actions: int) -> None:
+    def log(self, entries: Mapping[str, Any], actions: int) -> None:
+        """Log entries by their names."""
         for log in self._logs:
             log.log(entries, actions)
+
+    def keep(self, file: Path, card: Mapping[str, Any]) -> None:
+        """Keep a policy in wandb, if the run has a log there."""
+        if self._wandb is not None:
+            self._wandb.keep(file, card)
 
     def flush(self) -> None:
         """Write what was logged, so that it survives the end of this process."""
@@ -135,6 +136,51 @@ class Tracker(Hook):
         """Finish the logs."""
         for log in self._logs:
             log.close()
+
+
+class Pictures(Hook):
+    """Shows the policy of a finished run, before the run is reported as finished.
+
+    So a run whose pictures were interrupted makes them when it is resumed.
+    """
+
+    def on_end(self, run: TrainingRun) -> None:
+        """Show the policy."""
+        if run.schedule.finished:
+            show_policy(run)
+
+
+def show_policy(run: TrainingRun) -> None:
+    """Log the paths of a run's policy, an episode, Q over a room, a table of episodes, the policy.
+
+    The worlds are those of the run's evaluations. Nothing is done unless pictures are asked for
+    and a log can show them. The clock of the run, which shows how long it trains, stands still.
+    """
+    if not run.tracker.shows:
+        return
+    settings = run.settings
+    begun, wanted, policy = time.perf_counter(), settings.evaluation, kept_policy(run)
+    file = run.folder / files.POLICY
+    save_policy(policy, file, overwrite=True)
+    driver = as_trained(policy)
+    [drives] = drive(
+        driver, [wanted.world], episodes=wanted.episodes, seed=SEED, physics=None, progress=False
+    )
+    values = values_of(run.learner, policy, settings)
+    with TemporaryDirectory() as place:
+        pictures = Path(place)
+        write_pictures(driver, [drives], pictures, values=values)
+        entries: dict[str, Any] = {
+            "policy/paths": np.asarray(Image.open(pictures / TRAJECTORIES)),
+            "policy/values": np.asarray(Image.open(pictures / VALUES)),
+            "policy/episode": pictures / EPISODE,
+            "policy/episodes": as_table(drives.results, EpisodeResult),
+        }
+        run.tracker.log(entries, run.actions)
+        run.tracker.keep(file, policy.card)
+        # What cannot be written is missed now, not after the run was reported as finished.
+        run.tracker.flush()
+    run.robots.seconds -= time.perf_counter() - begun
 
 
 def log_evaluation(
@@ -154,8 +200,6 @@ def log_evaluation(
     """
     if not ((run / "wandb").is_dir() and (run / files.CHECKPOINT).exists()):
         return None
-    from training.run.wandb_log import WandbLog
-
     state = read_checkpoint(run)
     settings, total = as_settings(state["settings"]), table.iloc[-1]
     if with_environment(settings.tracking).mode == "off":

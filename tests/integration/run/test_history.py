@@ -15,7 +15,7 @@ from torchrl_mpfa import (
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
-from training.run.history import ReplayHistory
+from training.run.updates import ReplayHistory
 
 
 def filled(sampler, rows=200):

@@ -52,6 +52,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
         change(settings)
         run = TrainingRun(settings, tmp_path_factory.mktemp(method))
         run.tracker._logs.append(Names())
+        run.tracker.shows = settings.tracking.pictures_every is not None
         run.train()
         run.close()
     return found

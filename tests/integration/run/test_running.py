@@ -15,9 +15,8 @@ from torch.utils import cpp_extension
 from tests.integration.tiny_runs import OVERRIDES, tiny, train
 from torchrl_mpfa import Learner
 from training.files import CHECKPOINT
-from training.run import compiling, loop
-from training.run.assembly import make_learner
-from training.run.compiling import is_compiled
+from training.run import assembly, loop
+from training.run.assembly import is_compiled, make_learner
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, prepare_process, start
 from training.settings.command_line import composed
@@ -154,7 +153,7 @@ def test_an_error_of_the_program_is_no_sentence(
 def test_a_run_is_compiled_by_its_settings_and_length(
     arguments: str, compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compiling, "has_compiler", lambda: True)
+    monkeypatch.setattr(assembly, "has_compiler", lambda: True)
     register()
     (settings,) = composed(["environment.physics=kinematic", *arguments.split()])
     assert is_compiled(settings) == compiled

@@ -19,8 +19,7 @@ from training import files
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.checkpoints import save
 from training.run.loop import TrainingRun
-from training.run.showing import show_policy
-from training.run.tracking import Tracker
+from training.run.tracking import Tracker, show_policy
 from training.settings.command_line import composed
 from training.settings.train import (
     Stage,
@@ -227,7 +226,7 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
         show_policy(run)
         took.append((time.perf_counter() - begun[0], run.robots.elapsed() - begun[1]))
 
-    monkeypatch.setattr("training.run.showing.show_policy", show)
+    monkeypatch.setattr("training.run.tracking.show_policy", show)
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
@@ -292,7 +291,7 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     settings = tiny(episodes=[Stage("A", 2)])
     settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, pictures_every=every)
-    monkeypatch.setattr("training.run.showing.show_policy", lambda run: shown.append(run.actions))
+    monkeypatch.setattr("training.run.tracking.show_policy", lambda run: shown.append(run.actions))
     train(tmp_path / "run", settings)
     (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
     assert shown == [*(range(20, end, 20) if every else ()), end]

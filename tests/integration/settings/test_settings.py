@@ -14,8 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from torchrl_mpfa.checks import rules_of
 from training.settings.checks import OF_A_METHOD, check_settings
-from training.settings.command_line import composed, parse_overrides
-from training.settings.from_file import with_lines
+from training.settings.command_line import composed, parse_overrides, with_lines
 from training.settings.resuming import changed
 from training.settings.rules import settings_by_name
 from training.settings.train import (

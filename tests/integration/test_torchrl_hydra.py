@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
-from hydra import compose, initialize_config_dir
+import torchrl.trainers.algorithms.configs  # noqa: F401  Adds TorchRL's groups.
+from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from torchrl.objectives import DDPGLoss, TD3Loss
-from torchrl.trainers import Trainer
+from torchrl.objectives import TD3Loss
 
 from tests.integration.test_torchrl_trainer import assert_learned
-from torchrl_config import main, train
-from torchrl_mpfa import (
-    MPFASampler,
-    SignalTensorStorage,
-)
 from torchrl_mpfa.integrations.trainer import PriorityStepper
 
 pytestmark = [
@@ -31,60 +24,18 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:The '.*' hook stage:FutureWarning"),
     pytest.mark.filterwarnings("ignore:OptimizerHook:FutureWarning"),
 ]
-EXAMPLES = Path(__file__).parents[2] / "examples"
-TINY = [
-    "frames=60",
-    "storage.max_size=100",
-    "replay_buffer.batch_size=4",
-    "collector.frames_per_batch=20",
-    "trainer.optim_steps_per_batch=3",
-    "trainer.progress_bar=false",
-    "actor.width=16",
-    "critic.width=16",
-]
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture(autouse=True)
 def hydra_at_work() -> Iterator[None]:
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+    with initialize(config_path=None, version_base="1.3"):
         yield
 
 
-def tiny(*overrides: str) -> Trainer:
-    return train(compose("torchrl_config", [*TINY, *overrides]))
-
-
-def test_the_composed_pipeline_updates_the_priorities_of_what_it_replays() -> None:
-    trainer = tiny()
-    assert_learned(trainer)
-    assert trainer.optimization_stepper.priority_updates == 9
-    buffer = trainer.replay_buffer
-    assert type(buffer.sampler) is MPFASampler
-    assert type(buffer.storage) is SignalTensorStorage
-    assert type(trainer.loss_module) is DDPGLoss
-    assert buffer.sampler.max_size == buffer.storage.max_size == 100
-
-
-def test_the_policy_that_collects_has_the_weights_that_were_learned() -> None:
-    trainer = tiny()
-    learned = trainer.loss_module.actor_network_params.flatten_keys(".")
-    collecting = dict(trainer.collector.policy.named_parameters())
-    assert collecting
-    for name, weights in collecting.items():
-        assert weights.data_ptr() != learned[name].data_ptr()
-        assert weights.equal(learned[name])
-
-
-def test_many_robots_in_the_worlds_of_a_generator_are_one_setting_away() -> None:
-    trainer = tiny("world=mixed", "env.base_env.num_envs=5")
-    robots = trainer.replay_buffer[:]["collector", "traj_ids"][:20].unique()
-    assert len(robots) >= 5
-    assert_learned(trainer)
-
-
 def test_the_configuration_of_the_page_builds_a_buffer() -> None:
-    page = (EXAMPLES.parent / "docs" / "torchrl_trainer.md").read_text(encoding="utf-8")
+    page = (DOCS / "torchrl_trainer.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     given = OmegaConf.create(text)
     ConfigStore.instance().store(name="page", node=given)
@@ -137,26 +88,3 @@ def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
     trainer.train()
     assert type(trainer.loss_module) is TD3Loss
     assert_learned(trainer)
-
-
-def test_the_script_trains_by_its_command_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    GlobalHydra.instance().clear()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        sys, "argv", ["torchrl_config.py", *TINY, "sampler._target_=torchrl_mpfa.SignalSampler"]
-    )
-    main()
-    printed = capsys.readouterr().out
-    assert "updates of priorities   9" in printed
-    assert "signal td_error         weight 1.000" in printed
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_seed_is_set_before_the_networks_are_made() -> None:
-    config = compose("torchrl_config", [*TINY, "seed=5"])
-    torch.manual_seed(5)
-    expected = next(iter(instantiate(config.trainer).loss_module.parameters())).clone()
-    torch.manual_seed(5)
-    assert next(iter(instantiate(config.trainer).loss_module.parameters())).equal(expected)
