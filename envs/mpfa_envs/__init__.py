@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.shapes import Box as Box
     from mpfa_envs.worlds.shapes import Cylinder as Cylinder
     from mpfa_envs.worlds.shapes import Polygon as Polygon
-    from mpfa_envs.worlds.task import Task as Task
     from mpfa_envs.worlds.walker import Walker as Walker
+    from mpfa_envs.worlds.world import Task as Task
     from mpfa_envs.worlds.world import World as World
     from mpfa_envs.worlds.world_file import load_world as load_world
     from mpfa_envs.worlds.world_file import save_world as save_world
@@ -89,9 +89,8 @@ _NAMES = {
     "tasks.sets": "WorldTask world_tasks",
     "worlds.builtin": "WORLDS",
     "worlds.shapes": "Box Cylinder Polygon",
-    "worlds.task": "Task",
     "worlds.walker": "Walker",
-    "worlds.world": "World",
+    "worlds.world": "Task World",
     "worlds.world_file": "load_world save_world",
     "worlds.yaml_nodes": "WorldFileError",
 }

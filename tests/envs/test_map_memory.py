@@ -26,7 +26,7 @@ from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 from tests.envs.paper import drive_to_end
 from tests.envs.shapes import random_shapes
 

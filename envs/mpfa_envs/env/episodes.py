@@ -22,8 +22,7 @@ from mpfa_envs.tasks.doors import cell_share, warn_of_parts
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from mpfa_envs.env.episodes import WorldChoice
     from mpfa_envs.scene.window import Window
     from mpfa_envs.sensing.lidar import Lidar
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import Episode
     from mpfa_envs.sensing.lidar import Lidar
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 _TRAIL = 500
 """Time steps that trails have room for at first."""

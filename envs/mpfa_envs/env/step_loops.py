@@ -10,7 +10,7 @@ import numpy as np
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
 from mpfa_envs.tasks import reward
-from mpfa_envs.worlds.clearance_loops import clearance_at
+from mpfa_envs.worlds.arrays import clearance_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

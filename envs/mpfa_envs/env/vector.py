@@ -28,8 +28,7 @@ from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.env.state import read_state, robot_to_plain
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -27,8 +27,7 @@ from mpfa_envs.generators.rooms import rooms
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 Generator: TypeAlias = Callable[[random.Random, float], World]
 """A function that samples a world of a difficulty in [0, 1]."""

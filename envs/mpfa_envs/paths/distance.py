@@ -28,7 +28,7 @@ from mpfa_envs.paths.grid_loops import (
     fill_from_nearest,
     interpolate,
 )
-from mpfa_envs.worlds.cell_loops import lower_clearances
+from mpfa_envs.worlds.arrays import lower_clearances
 from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1

@@ -16,8 +16,7 @@ from mpfa_envs.paths.lengths import grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.tasks.doors import cell_share, kept_in, warn_of_parts
-from mpfa_envs.worlds.task import START_SLACK, Task
-from mpfa_envs.worlds.world import Box, World
+from mpfa_envs.worlds.world import START_SLACK, Box, Task, World
 
 GOAL_CLEARANCE = 0.5
 """No goal lies nearer to an obstacle or a wall than this [m]."""

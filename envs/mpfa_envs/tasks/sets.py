@@ -13,8 +13,7 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.barn import barn_task, barn_worlds, load_barn
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 TASKS_PER_WORLD: Final = 4
 """Number of tasks in each world of a generator."""
