@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs import Lidar, Task, World
-from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.lengths import shortest_length
+from mpfa_envs.paths.distance import FreeGrid, shortest_length
 from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.sensing.lidar_loops import cast_rays
 from mpfa_envs.worlds.arrays import BatchArrays, clearance_at

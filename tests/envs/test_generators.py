@@ -24,8 +24,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.generators.generate import generator_tasks, split_worlds, world_seed
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.lengths import is_reachable
+from mpfa_envs.paths.distance import FreeGrid, is_reachable
 from mpfa_envs.paths.tasks import sample_task_on_grid
 
 NAMES = list(GENERATORS)

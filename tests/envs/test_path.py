@@ -9,7 +9,7 @@ import pytest
 
 import mpfa_envs
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, World, world_tasks
-from mpfa_envs.paths.lengths import is_reachable, shortest_length
+from mpfa_envs.paths.distance import is_reachable, shortest_length
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.barn import barn_task, barn_world
 

@@ -21,8 +21,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.runs import Driver
-from mpfa_envs.paths.field_loops import path_lengths
-from mpfa_envs.paths.grid_loops import MOVES
+from mpfa_envs.paths.grid_loops import MOVES, path_lengths
 from mpfa_envs.planners import PredictiveControl
 from mpfa_envs.planners.predictive_loops import (
     CELL,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
-from mpfa_envs.paths.lengths import is_reachable
+from mpfa_envs.paths.distance import is_reachable
 from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
 from tests.envs.paper import drive_to_end, full_speed
 from tests.envs.process import run

@@ -14,8 +14,7 @@ import numpy as np
 from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
 from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.lengths import grid_for, shortest_length
+from mpfa_envs.paths.distance import DistanceField, FreeGrid, grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.safety.filter import CLEARANCE
 from mpfa_envs.tasks.doors import cell_share, warn_of_parts

@@ -20,7 +20,7 @@ from mpfa_envs.env.step_loops import (
     measure_remaining,
     settle,
 )
-from mpfa_envs.paths.batch import FieldArrays
+from mpfa_envs.paths.distance import FieldArrays
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory

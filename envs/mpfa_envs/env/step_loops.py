@@ -15,7 +15,7 @@ from mpfa_envs.worlds.arrays import clearance_at
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.paths.batch import FieldArrays
+    from mpfa_envs.paths.distance import FieldArrays
     from mpfa_envs.worlds.arrays import BatchArrays
 
 # Compiled here: the package's first import knows the function without Numba.

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from mpfa_envs.generators.generate import world_of_name
-from mpfa_envs.paths.lengths import NARROW, grid_for
+from mpfa_envs.paths.distance import NARROW, grid_for
 from mpfa_envs.robots.model import PAPER_CLEARANCE, RobotModel
 from mpfa_envs.safety.filter import CLEARANCE
 from mpfa_envs.worlds.barn import barn_world

@@ -11,8 +11,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_count, check_seed
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.lengths import grid_for, is_reachable
+from mpfa_envs.paths.distance import FreeGrid, grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.tasks.doors import cell_share, kept_in, warn_of_parts
