@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.deploy.sectors import Points
 from mpfa_envs.sensing.map_loops import UNKNOWN
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
+from mpfa_envs.sensing.sectors import Points
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,12 +14,11 @@ from mpfa_envs.deploy.keeping_off import body_of, filter_of
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.pace import pace_of, tolerance
 from mpfa_envs.deploy.places import check_on_map, pair_of, placed, sides_of
-from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
-from mpfa_envs.deploy.views import observations_from
 from mpfa_envs.deploy.way_back import WayBack
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.sensing.sectors import Scan, ScanError, Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
     import os

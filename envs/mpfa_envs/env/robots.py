@@ -24,8 +24,7 @@ from mpfa_envs.paths.distance import FieldArrays
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation import FLAGS, NUMBERS
-from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
+from mpfa_envs.sensing.observation import FLAGS, NUMBERS, lidar_pose, look_from, observe_all
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.arrays import grown

@@ -20,7 +20,7 @@ from mpfa_envs.ros.inputs import Felt, Seen, Sight, Track
 
 if TYPE_CHECKING:
     from mpfa_envs.deploy.pilot import Command, Pilot
-    from mpfa_envs.deploy.sectors import Scan
+    from mpfa_envs.sensing.sectors import Scan
     from mpfa_envs.worlds.world import World
 
 _EARLY: Final = 0.2

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.pilot import Pilot
-    from mpfa_envs.deploy.sectors import Points, Scan
     from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.sensing.sectors import Points, Scan
 
 Pose = tuple[float, float, float]
 _AHEAD: Final = 0.15
