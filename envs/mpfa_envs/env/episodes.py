@@ -19,13 +19,13 @@ from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.safety.filter import CLEARANCE
 from mpfa_envs.tasks.doors import cell_share, warn_of_parts
 from mpfa_envs.tasks.sampling import check_task, sample_task
-from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.walkers.batch import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
 from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.walkers.starts import WalkerStarts
+    from mpfa_envs.walkers.batch import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """A built-in world's name, the path of a world file, or a world."""

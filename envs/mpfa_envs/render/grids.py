@@ -17,7 +17,7 @@ from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import viridis
-from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.walkers.batch import start_walkers
 from mpfa_envs.worlds.world import Task, World
 
 Array = NDArray[np.float64]
