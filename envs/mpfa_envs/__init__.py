@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from mpfa_envs.tasks.reward import RewardTerms as RewardTerms
     from mpfa_envs.tasks.reward import StepOutcome as StepOutcome
     from mpfa_envs.tasks.reward import navigation_reward as navigation_reward
-    from mpfa_envs.tasks.sets import WorldTask as WorldTask
-    from mpfa_envs.tasks.sets import world_tasks as world_tasks
+    from mpfa_envs.tasks.sampling import WorldTask as WorldTask
+    from mpfa_envs.tasks.sampling import world_tasks as world_tasks
     from mpfa_envs.worlds.builtin import WORLDS as WORLDS
     from mpfa_envs.worlds.shapes import Box as Box
     from mpfa_envs.worlds.shapes import Cylinder as Cylinder
@@ -86,7 +86,7 @@ _NAMES = {
     "sensing.mirror": "Mirror RandomMirror",
     "sensing.observation": "OBSERVATION",
     "tasks.reward": "RewardTerms StepOutcome navigation_reward",
-    "tasks.sets": "WorldTask world_tasks",
+    "tasks.sampling": "WorldTask world_tasks",
     "worlds.builtin": "WORLDS",
     "worlds.shapes": "Box Cylinder Polygon",
     "worlds.walker": "Walker",

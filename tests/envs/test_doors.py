@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import ROBOTS, WORLDS, Box, VectorNavigationEnv, World, world_tasks
-from mpfa_envs.tasks.doors import is_built_in
-from mpfa_envs.tasks.sampling import evaluation_pairs
+from mpfa_envs.tasks.sampling import evaluation_pairs, is_built_in
 from mpfa_envs.worlds.shapes import OccupancyGrid
 from mpfa_envs.worlds.world import Task
 

@@ -33,7 +33,7 @@ from mpfa_envs.planners.predictive_loops import (
     room_around,
 )
 from mpfa_envs.robots.model import ROBOTS, RobotModel
-from mpfa_envs.tasks.sets import WorldTask
+from mpfa_envs.tasks.sampling import WorldTask
 
 KOBUKI = TaskConfig(robot="kobuki", memory="map").make_filter()
 BODY = KOBUKI.body

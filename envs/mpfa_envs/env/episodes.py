@@ -17,8 +17,7 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid, grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.safety.filter import CLEARANCE
-from mpfa_envs.tasks.doors import cell_share, warn_of_parts
-from mpfa_envs.tasks.sampling import check_task, sample_task
+from mpfa_envs.tasks.sampling import cell_share, check_task, sample_task, warn_of_parts
 from mpfa_envs.walkers.batch import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
 from mpfa_envs.worlds.world import Task, World

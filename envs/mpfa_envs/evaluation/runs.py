@@ -24,7 +24,7 @@ from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.robots.standing import stands_still
-from mpfa_envs.tasks.sets import WorldTask, world_tasks
+from mpfa_envs.tasks.sampling import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
 Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]

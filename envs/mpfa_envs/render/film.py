@@ -14,7 +14,7 @@ from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.runs import Action, Driver, as_driver, drive_steps
 from mpfa_envs.render.traces import Panel, render_traces
-from mpfa_envs.tasks.sets import WorldTask
+from mpfa_envs.tasks.sampling import WorldTask
 
 _RECENT = 10.0
 """Time span of the wheel speeds [s]."""
