@@ -20,7 +20,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.results import barn_score
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world, barn_worlds, load_barn
 

@@ -20,7 +20,7 @@ from mpfa_envs import (
     World,
     generate_world,
 )
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT

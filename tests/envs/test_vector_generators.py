@@ -16,8 +16,7 @@ from mpfa_envs import (
     World,
 )
 from mpfa_envs.env import episodes
-from mpfa_envs.generators.generate import generate_world
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import generate_world, resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 
 GENERATOR_IDS = [each for each in ENV_IDS if each.split("-")[1] not in WORLDS]

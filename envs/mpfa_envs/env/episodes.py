@@ -12,8 +12,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
-from mpfa_envs.generators.generate import GENERATORS, generate_world, world_of_name, world_seed
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import (
+    GENERATORS,
+    generate_world,
+    resolve_world,
+    world_of_name,
+    world_seed,
+)
 from mpfa_envs.paths.distance import DistanceField, FreeGrid, grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.safety.filter import CLEARANCE

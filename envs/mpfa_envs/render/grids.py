@@ -14,7 +14,7 @@ from mpfa_envs.checks import check_number, check_positive
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.env.episodes import Episode
 from mpfa_envs.env.robots import RobotBatch
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import viridis
 from mpfa_envs.walkers.batch import start_walkers

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.render.grids import fill_cells
 from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import shares_of

@@ -14,8 +14,13 @@ from typing import Any, Final, NamedTuple, cast, get_args
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_seed, did_you_mean
-from mpfa_envs.generators.generate import GENERATORS, Split, generator_tasks, world_of_name
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import (
+    GENERATORS,
+    Split,
+    generator_tasks,
+    resolve_world,
+    world_of_name,
+)
 from mpfa_envs.paths.distance import NARROW, FreeGrid, grid_for, is_reachable
 from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
 from mpfa_envs.robots.model import PAPER_CLEARANCE, RobotModel
