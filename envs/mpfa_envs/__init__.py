@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from mpfa_envs.planners import PLANNERS as PLANNERS
     from mpfa_envs.planners import make_planner as make_planner
     from mpfa_envs.policies.export import export_policy as export_policy
-    from mpfa_envs.policies.files import POLICIES as POLICIES
-    from mpfa_envs.policies.files import load_policy as load_policy
-    from mpfa_envs.policies.files import save_policy as save_policy
+    from mpfa_envs.policies.policy import POLICIES as POLICIES
     from mpfa_envs.policies.policy import Policy as Policy
+    from mpfa_envs.policies.policy import load_policy as load_policy
+    from mpfa_envs.policies.policy import save_policy as save_policy
     from mpfa_envs.robots.discrete import DiscreteWheels as DiscreteWheels
     from mpfa_envs.robots.model import ROBOTS as ROBOTS
     from mpfa_envs.robots.model import RobotModel as RobotModel
@@ -75,8 +75,7 @@ _NAMES = {
     "generators.generate": "GENERATORS generate_world register_generator",
     "planners": "PLANNERS make_planner",
     "policies.export": "export_policy",
-    "policies.files": "POLICIES load_policy save_policy",
-    "policies.policy": "Policy",
+    "policies.policy": "POLICIES Policy load_policy save_policy",
     "robots.discrete": "DiscreteWheels",
     "robots.model": "ROBOTS RobotModel",
     "robots.noise": "RobotNoise",
