@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.deploy.card import CardError, read_exported
-from mpfa_envs.deploy.network import Network
+from mpfa_envs.deploy.card import CardError, Network, read_exported
 from mpfa_envs.files import cause_of, check_replaceable, read_file, write_atomically
 from mpfa_envs.policies.layers import KINDS, Layer, arrays_of, check_layers, from_torch
 from mpfa_envs.robots.resolve import resolve_robot
