@@ -21,6 +21,7 @@ from mpfa_envs.render.trajectories import (
     render_trajectories,
     shown_episodes,
 )
+from mpfa_envs.scene.canvas import tiled
 from mpfa_envs.scene.colors import (
     FLOOR,
     GOAL,
@@ -33,7 +34,6 @@ from mpfa_envs.scene.colors import (
     viridis,
 )
 from mpfa_envs.scene.scene import render_scene
-from mpfa_envs.scene.tiles import tiled
 
 __all__ = [
     "FLOOR",

@@ -18,10 +18,20 @@ from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
-from mpfa_envs.scene.canvas import FINE, Canvas, Point
+from mpfa_envs.scene.canvas import (
+    FINE,
+    HEIGHT,
+    Canvas,
+    Entry,
+    Facing,
+    Point,
+    Scale,
+    strip_width,
+    tiled,
+    titled,
+    write_strip,
+)
 from mpfa_envs.scene.colors import ROBOT_FRONT, TEXT, shares_of, viridis
-from mpfa_envs.scene.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip
-from mpfa_envs.scene.tiles import tiled
 from mpfa_envs.walkers.batch import start_walkers
 from mpfa_envs.worlds.world import Task, World
 
