@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from mpfa_envs import WorldTask
 from mpfa_envs.render import drive_episode
-from mpfa_envs.scene.window import Window
+from mpfa_envs.scene.scene import Window
 from training.evaluating import Drivable
 
 _PAUSE = 1.0
