@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from mpfa_envs.checks import check_share
 from mpfa_envs.deploy.card import CardError
-from mpfa_envs.robots.orders import STRENGTH
+from mpfa_envs.robots.drives import STRENGTH
 from mpfa_envs.safety.filter import SafetyFilter, check_view
 from mpfa_envs.sensing.lidar import ray_angles
 

@@ -12,8 +12,8 @@ from mpfa_envs.deploy.adaptation import body_of, filter_of, pace_of, tolerance
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, placed, sides_of
+from mpfa_envs.robots.drives import Orders
 from mpfa_envs.robots.motion_loops import changed
-from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.sectors import Scan, ScanError, Sectors, Silent, observations_from
 
