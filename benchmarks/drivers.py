@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from mpfa_envs import POLICIES, load_policy
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from torchrl_mpfa.saving import write_text_atomically
 from training import files

@@ -43,7 +43,7 @@ from mpfa_envs import (
     load_policy,
     make_planner,
 )
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE
 from training import files

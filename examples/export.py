@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy, world_tasks
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
 from training import files

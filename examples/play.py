@@ -32,8 +32,7 @@ from mpfa_envs import (
     WorldTask,
     load_policy,
 )
-from mpfa_envs.scene.scene import render_scene
-from mpfa_envs.scene.window import Window
+from mpfa_envs.scene.scene import Window, render_scene
 from training.evaluating import add_robot, on_robot, tasks_of
 from training.worlds import parse_worlds
 

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.speed.bullet_world import BulletWorld
 from benchmarks.speed.timing import Call, Entry, entry, seconds_per_call, take_turns
 from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, TaskConfig, World
-from mpfa_envs.paths.lengths import grid_for, is_reachable, shortest_length
+from mpfa_envs.paths.distance import grid_for, is_reachable, shortest_length
 from mpfa_envs.planners import shortest_path
 from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.tasks.sampling import evaluation_pairs

@@ -16,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs import Lidar, Task, World
-from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.lengths import shortest_length
+from mpfa_envs.paths.distance import FreeGrid, shortest_length
 from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.sensing.lidar_loops import cast_rays
-from mpfa_envs.worlds.arrays import BatchArrays
+from mpfa_envs.worlds.arrays import BatchArrays, clearance_at
 from mpfa_envs.worlds.batch import WorldBatch
-from mpfa_envs.worlds.clearance_loops import clearance_at
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 
 SIDE, ROOM, CELL = 2000, 160, 0.05
 ROBOTS = 4

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from mpfa_envs.planners import PLANNERS as PLANNERS
     from mpfa_envs.planners import make_planner as make_planner
     from mpfa_envs.policies.export import export_policy as export_policy
-    from mpfa_envs.policies.files import POLICIES as POLICIES
-    from mpfa_envs.policies.files import load_policy as load_policy
-    from mpfa_envs.policies.files import save_policy as save_policy
+    from mpfa_envs.policies.policy import POLICIES as POLICIES
     from mpfa_envs.policies.policy import Policy as Policy
+    from mpfa_envs.policies.policy import load_policy as load_policy
+    from mpfa_envs.policies.policy import save_policy as save_policy
     from mpfa_envs.robots.discrete import DiscreteWheels as DiscreteWheels
     from mpfa_envs.robots.model import ROBOTS as ROBOTS
     from mpfa_envs.robots.model import RobotModel as RobotModel
@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from mpfa_envs.tasks.reward import RewardTerms as RewardTerms
     from mpfa_envs.tasks.reward import StepOutcome as StepOutcome
     from mpfa_envs.tasks.reward import navigation_reward as navigation_reward
-    from mpfa_envs.tasks.sets import WorldTask as WorldTask
-    from mpfa_envs.tasks.sets import world_tasks as world_tasks
+    from mpfa_envs.tasks.sampling import WorldTask as WorldTask
+    from mpfa_envs.tasks.sampling import world_tasks as world_tasks
     from mpfa_envs.worlds.builtin import WORLDS as WORLDS
     from mpfa_envs.worlds.shapes import Box as Box
     from mpfa_envs.worlds.shapes import Cylinder as Cylinder
     from mpfa_envs.worlds.shapes import Polygon as Polygon
-    from mpfa_envs.worlds.task import Task as Task
     from mpfa_envs.worlds.walker import Walker as Walker
+    from mpfa_envs.worlds.world import Task as Task
     from mpfa_envs.worlds.world import World as World
     from mpfa_envs.worlds.world_file import load_world as load_world
     from mpfa_envs.worlds.world_file import save_world as save_world
@@ -75,8 +75,7 @@ _NAMES = {
     "generators.generate": "GENERATORS generate_world register_generator",
     "planners": "PLANNERS make_planner",
     "policies.export": "export_policy",
-    "policies.files": "POLICIES load_policy save_policy",
-    "policies.policy": "Policy",
+    "policies.policy": "POLICIES Policy load_policy save_policy",
     "robots.discrete": "DiscreteWheels",
     "robots.model": "ROBOTS RobotModel",
     "robots.noise": "RobotNoise",
@@ -86,12 +85,11 @@ _NAMES = {
     "sensing.mirror": "Mirror RandomMirror",
     "sensing.observation": "OBSERVATION",
     "tasks.reward": "RewardTerms StepOutcome navigation_reward",
-    "tasks.sets": "WorldTask world_tasks",
+    "tasks.sampling": "WorldTask world_tasks",
     "worlds.builtin": "WORLDS",
     "worlds.shapes": "Box Cylinder Polygon",
-    "worlds.task": "Task",
     "worlds.walker": "Walker",
-    "worlds.world": "World",
+    "worlds.world": "Task World",
     "worlds.world_file": "load_world save_world",
     "worlds.yaml_nodes": "WorldFileError",
 }

@@ -133,7 +133,7 @@ def watch(
     The key N starts the next task, Escape ends.
     """
     # Only here, as it needs pygame, an extra of its own.
-    from mpfa_envs.scene.window import Window
+    from mpfa_envs.scene.scene import Window
 
     window: Window | None = None
     for number, task in enumerate(tasks):

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import label, maximum
 
 from mpfa_envs import GENERATORS, World, world_tasks
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 

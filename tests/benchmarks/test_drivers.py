@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import drivers
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from training import files
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mpfa_envs import Box, Cylinder, Polygon, World
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 
 
 def random_shapes(

@@ -13,7 +13,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import ROBOTS, Box, RobotModel, World
 from mpfa_envs.deploy import Pilot, Scan
-from mpfa_envs.deploy.places import placed
+from mpfa_envs.deploy.map_path import placed
 from mpfa_envs.robots.drives import KinematicDrives
 from tests.envs.exported import card
 from tests.envs.test_deploy_filter import ALL_ROUND, KOBUKI, a_pilot, wall_at

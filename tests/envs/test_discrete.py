@@ -22,8 +22,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.policies.layers import Choice, Linear, Table
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
-from mpfa_envs.sensing.binning import Binning
-from mpfa_envs.sensing.observation import observation_slices
+from mpfa_envs.sensing.observation import Binning, observation_slices
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, generate_world
-from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.field_loops import path_lengths
-from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
-from mpfa_envs.paths.lengths import is_reachable
+from mpfa_envs.paths.distance import DistanceField, FreeGrid, is_reachable
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
 from mpfa_envs.paths.tasks import sample_task_on_grid
 
 MIXED = World(

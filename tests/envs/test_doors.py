@@ -10,8 +10,8 @@ import pytest
 
 from mpfa_envs import ROBOTS, WORLDS, Box, VectorNavigationEnv, World, world_tasks
 from mpfa_envs.tasks.sampling import evaluation_pairs
-from mpfa_envs.worlds.occupancy import OccupancyGrid
-from mpfa_envs.worlds.task import Task
+from mpfa_envs.worlds.shapes import OccupancyGrid
+from mpfa_envs.worlds.world import Task
 
 CART = replace(
     ROBOTS["kobuki"], name="cart", radius=0.31, wheel_base=0.46, min_wheel_speed=-0.9,

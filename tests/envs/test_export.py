@@ -16,7 +16,7 @@ from mpfa_envs import Policy, export_policy, load_policy, save_policy
 from mpfa_envs.deploy import CardError, Pilot
 from mpfa_envs.policies.layers import Choice, Clip, Linear, ReLU, Scale, Table, Tanh
 from mpfa_envs.policies.policy import PolicyFileError
-from mpfa_envs.sensing.binning import Binning
+from mpfa_envs.sensing.observation import Binning
 from tests.envs.exported import SHIPPED, exported, make_policy
 
 

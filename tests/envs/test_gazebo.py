@@ -7,7 +7,7 @@ import time
 import pytest
 
 from mpfa_envs import NavigationEnv, WorldFileError
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.worlds.barn import barn_task, barn_world
 from mpfa_envs.worlds.gazebo import load_gazebo_world
 from tests.envs.sdf import CYLINDER, box, model, quietly, walls, write

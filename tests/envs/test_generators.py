@@ -19,8 +19,7 @@ from mpfa_envs import (
     generate_world,
     register_generator,
 )
-from mpfa_envs.generators.generate import generator_tasks, split_worlds, world_seed
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import generator_tasks, resolve_world, split_worlds, world_seed
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.tasks import sample_task_on_grid
 

@@ -10,8 +10,8 @@ import pytest
 from mpfa_envs import ROBOTS, WORLDS, Lidar, TaskConfig, World
 from mpfa_envs.compiled import njit
 from mpfa_envs.robots.drives import KinematicDrives
+from mpfa_envs.worlds.arrays import clearance_at
 from mpfa_envs.worlds.batch import WorldBatch
-from mpfa_envs.worlds.clearance_loops import clearance_at
 from tests.envs.plain_robot import drive_arc, scan
 from tests.envs.process import run
 from tests.envs.shapes import distance, random_shapes

@@ -14,7 +14,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import ROBOTS, export_policy, load_policy
 from mpfa_envs.deploy import Pilot, Scan
-from mpfa_envs.robots.orders import Orders
+from mpfa_envs.robots.drives import Orders
 from mpfa_envs.ros.controller import Controller
 
 KOBUKI = ROBOTS["kobuki"]

@@ -19,12 +19,12 @@ from mpfa_envs import (
     World,
     generate_world,
 )
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_loops import BLOCKED, TIGHT
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]

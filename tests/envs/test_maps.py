@@ -20,7 +20,7 @@ from mpfa_envs import (
     save_world,
 )
 from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 from tests.envs.map_files import write_map
 from tests.envs.shapes import GRID, SCATTERED, cells
 

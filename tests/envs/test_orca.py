@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
-from mpfa_envs.walkers.batch import WalkerBatch
-from mpfa_envs.walkers.orca import OrcaRoom, _outlines
+from mpfa_envs.walkers.batch import OrcaRoom, WalkerBatch, _outlines
 from mpfa_envs.worlds.batch import WorldBatch
 
 pytest.importorskip("pyrvo", reason="an extra")

@@ -9,7 +9,7 @@ import pytest
 
 import mpfa_envs
 from mpfa_envs import WORLDS, Box, NavigationEnv, Polygon, World, world_tasks
-from mpfa_envs.paths.lengths import is_reachable, shortest_length
+from mpfa_envs.paths.distance import is_reachable, shortest_length
 from mpfa_envs.tasks.sampling import evaluation_pairs
 
 BLOCK = World(name="block", boxes=(Box(-1.0, -2.0, 1.0, 2.0),))

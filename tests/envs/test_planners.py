@@ -23,7 +23,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.runs import as_driver
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners import (
     AntColony,

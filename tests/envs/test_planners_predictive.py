@@ -20,8 +20,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.runs import Driver
-from mpfa_envs.paths.field_loops import path_lengths
-from mpfa_envs.paths.grid_loops import MOVES
+from mpfa_envs.paths.grid_loops import MOVES, path_lengths
 from mpfa_envs.planners import PredictiveControl
 from mpfa_envs.planners.predictive_loops import (
     CELL,
@@ -33,7 +32,7 @@ from mpfa_envs.planners.predictive_loops import (
     room_around,
 )
 from mpfa_envs.robots.model import ROBOTS, RobotModel
-from mpfa_envs.tasks.sets import WorldTask
+from mpfa_envs.tasks.sampling import WorldTask
 
 KOBUKI = TaskConfig(robot="kobuki", memory="map").make_filter()
 BODY = KOBUKI.body

@@ -200,7 +200,7 @@ def test_a_foreign_file_is_rejected_with_the_reason(
 def test_a_file_that_unpacks_to_much_is_rejected_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mpfa_envs.policies.files._LARGEST", 1000)
+    monkeypatch.setattr("mpfa_envs.policies.policy._LARGEST", 1000)
     file = tmp_path / "large.npz"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("about.npy", b"\0" * 1001)

@@ -35,7 +35,7 @@ from mpfa_envs.generators.generate import generator_tasks, split_worlds
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
-from mpfa_envs.sensing.binning import Binning
+from mpfa_envs.sensing.observation import Binning
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from tests.envs.exported import card, make_policy
 

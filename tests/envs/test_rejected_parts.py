@@ -26,8 +26,7 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
-from mpfa_envs.generators.generate import generator_tasks, split_worlds, world_seed
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import generator_tasks, resolve_world, split_worlds, world_seed
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.planners import AntColony, DynamicWindow

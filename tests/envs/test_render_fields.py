@@ -9,14 +9,14 @@ from mpfa_envs import OBSERVATION, NavigationEnv, World, world_tasks
 from mpfa_envs.render import (
     Panel,
     film_episode,
+    grids,
     observe_room,
     render_samples,
     render_traces,
     render_values,
-    samples,
     viridis,
 )
-from mpfa_envs.render.values import arc_of
+from mpfa_envs.render.grids import arc_of
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import LINES
 from tests.envs.test_render import pixel
@@ -98,13 +98,13 @@ def test_samples_are_bright_where_transitions_priorities_and_samples_are_many() 
 
 
 def test_rates_are_in_units_of_uniform_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
-    ends, real = {}, samples.Scale
+    ends, real = {}, grids.Scale
 
-    def scale(name: str, low: float, high: float) -> samples.Scale:
+    def scale(name: str, low: float, high: float) -> grids.Scale:
         ends[name] = low, high
         return real(name, low, high)
 
-    monkeypatch.setattr(samples, "Scale", scale)
+    monkeypatch.setattr(grids, "Scale", scale)
     places = halves()
     counts = np.where(places[:, 0] > 0, 3, 1)
     render_samples("A", places, counts, counts, spacing=1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Walker, World, generate_world
-from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.walkers.batch import start_walkers
 
 FULL = replace(
     generate_world("rooms", 3), walkers=tuple(Walker(radius=0.5 + 0.01 * n) for n in range(26))

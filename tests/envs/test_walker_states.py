@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Lidar, Walker, World
-from mpfa_envs.walkers.batch import WalkerBatch
-from mpfa_envs.walkers.starts import WalkerStarts, start_walkers
+from mpfa_envs.walkers.batch import WalkerBatch, WalkerStarts, start_walkers
 from mpfa_envs.worlds.batch import WorldBatch
 
 HALL = World(name="hall", size=(40.0, 40.0), walkers=(Walker(speed=1.0),))

@@ -22,9 +22,8 @@ from mpfa_envs import (
     summarize,
 )
 from mpfa_envs.scene.colors import WALKER
-from mpfa_envs.walkers.batch import WalkerBatch
+from mpfa_envs.walkers.batch import WalkerBatch, start_walkers
 from mpfa_envs.walkers.loops import time_to_collision
-from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.batch import WorldBatch
 from tests.envs.busy import BUSY, POLITE, ROUND
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 from mpfa_envs import NavigationEnv
-from mpfa_envs.scene.window import Window
+from mpfa_envs.scene.scene import Window
 from tests.envs.process import run
 
 pygame = pytest.importorskip("pygame")
@@ -107,6 +107,6 @@ def test_triton_can_be_imported_after_a_window_was_opened(
     # Where there is neither screen nor setting, SDL picks a driver that renders in software.
     monkeypatch.delenv("SDL_VIDEODRIVER")
     run(
-        "import numpy as np; from mpfa_envs.scene.window import Window\n"
+        "import numpy as np; from mpfa_envs.scene.scene import Window\n"
         "window = Window('test', fps=30); window.show(np.zeros((9, 9, 3), np.uint8)); import triton"
     )

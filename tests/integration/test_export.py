@@ -14,7 +14,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 import evaluate
 import export
 from mpfa_envs import load_policy
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.model import ROBOTS
 
 SHIPPED = "td3-paper"

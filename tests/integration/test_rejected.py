@@ -18,7 +18,7 @@ import play
 import report
 import train
 import tune
-from mpfa_envs.policies.files import policy_file
+from mpfa_envs.policies.policy import policy_file
 from training import files
 
 POLICY = "td3-paper"

@@ -22,7 +22,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.deploy import Pilot
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from tests.envs.exported import SHIPPED

@@ -14,9 +14,9 @@ pytest.importorskip("onnxruntime", reason="exported policies are of the extra on
 
 from mpfa_envs import ROBOTS, Cylinder, World
 from mpfa_envs.deploy import Pilot, Scan
-from mpfa_envs.deploy.sectors import Silent
 from mpfa_envs.ros.controller import Controller, Order
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
+from mpfa_envs.sensing.sectors import Silent
 from tests.envs.exported import card
 
 HALL = World(name="hall", size=(30.0, 6.0))

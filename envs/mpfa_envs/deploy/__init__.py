@@ -13,10 +13,9 @@ nor PyBullet. ``examples/export.py`` writes the files that it reads.
 
 from __future__ import annotations
 
-from mpfa_envs.deploy.card import Card, CardError, card_file, read_exported
-from mpfa_envs.deploy.network import Network
+from mpfa_envs.deploy.card import Card, CardError, Network, card_file, read_exported
 from mpfa_envs.deploy.pilot import Command, Pilot
-from mpfa_envs.deploy.sectors import Points, Scan, ScanError, Sectors
+from mpfa_envs.sensing.sectors import Points, Scan, ScanError, Sectors
 
 __all__ = [
     "Card",

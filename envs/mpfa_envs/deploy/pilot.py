@@ -8,18 +8,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_not_negative, check_number, check_positive
-from mpfa_envs.deploy.arrival import Arrival
-from mpfa_envs.deploy.card import Card, check_finite, read_exported
-from mpfa_envs.deploy.keeping_off import body_of, filter_of
-from mpfa_envs.deploy.network import Network
-from mpfa_envs.deploy.pace import pace_of, tolerance
-from mpfa_envs.deploy.places import check_on_map, pair_of, placed, sides_of
-from mpfa_envs.deploy.sectors import Scan, ScanError, Sectors, Silent
-from mpfa_envs.deploy.views import observations_from
-from mpfa_envs.deploy.way_back import WayBack
+from mpfa_envs.deploy.adaptation import body_of, filter_of, pace_of, tolerance
+from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
+from mpfa_envs.deploy.maneuvers import Arrival, WayBack
+from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, placed, sides_of
+from mpfa_envs.robots.drives import Orders
 from mpfa_envs.robots.motion_loops import changed
-from mpfa_envs.robots.orders import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.sensing.sectors import Scan, ScanError, Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
     import os
@@ -27,7 +23,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.deploy.map_path import MapPath, Plan
     from mpfa_envs.worlds.world import World
 
 _TOWARDS: Final = math.radians(45.0)
@@ -121,9 +116,7 @@ class Pilot:
         self.goal_radius = self._arrival.radius
         self._map: MapPath | None = None
         if card.memory == "map":
-            # Imported here because it needs Numba, and compiled before the first decision is due.
-            from mpfa_envs.deploy.map_path import MapPath
-
+            # Its loops are compiled before the first decision is due.
             self._map = MapPath(card)
         self._body = body_of(card.robot, self.robot, self.pace)
         self._keep = filter_of(card, self.robot, self._body, clearance)
@@ -426,7 +419,7 @@ class Pilot:
 
     @property
     def stands_still(self) -> bool:
-        """True if the robot has come nowhere of late (``mpfa_envs.robots.standing``)."""
+        """True if the robot has come nowhere of late (``mpfa_envs.deploy.maneuvers``)."""
         return self._way_back.stands_still
 
     def ramp(

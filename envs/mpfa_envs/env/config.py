@@ -20,10 +20,9 @@ from mpfa_envs.checks import (
     check_share,
     did_you_mean,
 )
-from mpfa_envs.robots.drives import Physics
+from mpfa_envs.robots.drives import LateOrders, Physics
 from mpfa_envs.robots.model import PAPER_CLEARANCE, ROBOTS, TRAINING_CLEARANCE, RobotModel
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
-from mpfa_envs.robots.orders import LateOrders
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar

@@ -1,4 +1,4 @@
-"""The source of many robots' episodes: fixed worlds, or new ones of a generator."""
+"""The source of many robots' episodes, and the state of an environment: how they have gone."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
-from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
-from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.lengths import grid_for, shortest_length
+from mpfa_envs.generators.generate import (
+    GENERATORS,
+    generate_world,
+    resolve_world,
+    world_of_name,
+    world_seed,
+)
+from mpfa_envs.paths.distance import DistanceField, FreeGrid, grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.safety.filter import CLEARANCE
-from mpfa_envs.tasks.doors import cell_share, warn_of_parts
-from mpfa_envs.tasks.sampling import check_task, sample_task
-from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.tasks.sampling import cell_share, check_task, sample_task, warn_of_parts
+from mpfa_envs.walkers.batch import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.walkers.starts import WalkerStarts
+    from mpfa_envs.walkers.batch import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """A built-in world's name, the path of a world file, or a world."""
@@ -345,3 +349,77 @@ def _fingerprint(world: World) -> str:
     numbers = [part.tolist() for part in world.arrays], regions, walkers
     digest = hashlib.sha256(repr(numbers).encode() + cells)
     return f"{world.name} ({digest.hexdigest()[:8]})"
+
+
+def robot_to_plain(begin: EpisodeState, speeds: NDArray[np.float64]) -> dict[str, Any]:
+    """Turn the beginning of an episode, and the wheel speeds since, into plain values."""
+    if begin.given:
+        raise ValueError(
+            "an episode cannot be saved whose world or task the options of a reset gave: save "
+            "after the next reset() without them"
+        )
+    return {
+        "generator": copy.deepcopy(begin.generator),
+        "left": begin.left,
+        "kept": begin.kept.name if begin.kept and begin.left else None,
+        "speeds": speeds,
+    }
+
+
+def read_state(
+    state: Any, arguments: Mapping[str, Any], config: TaskConfig, source: EpisodeSource
+) -> tuple[list[EpisodeState], list[NDArray[np.float64]], list[np.random.Generator | None]]:
+    """Check a state: beginnings, wheel speeds since, and generators of the next episodes."""
+    try:
+        if "batch" in state:
+            raise ValueError(
+                "it is of an earlier version, and its episodes under way cannot be continued: "
+                "begin new ones with reset()"
+            )
+        for name, value in arguments.items():
+            if (found := state["arguments"].get(name)) != value:
+                raise ValueError(
+                    f"it must be of an environment with {name} = {value!r}, got one with {found!r}"
+                )
+        robots, count = state["robots"], arguments["num_envs"]
+        if len(robots) not in (0, count) or len(state["seeded"]) != count:
+            raise ValueError(f"robots and seeded must have {count} entries, got {len(robots)}")
+        if np.shape(np.array(state["positions"], dtype=np.float64)) != (count, 2):
+            raise ValueError(f"positions must have shape ({count}, 2)")
+        check_count("rejected", state["rejected"], least=0, most=math.inf)
+        driven = [_read_speeds(robot["speeds"], config) for robot in robots]
+        seeded = [None if seed is None else generator_at(seed) for seed in state["seeded"]]
+        return _read_states(robots, source), driven, seeded
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        reason = error if isinstance(error, ValueError) else f"no state_dict() gave it, {error!r}"
+        raise ValueError(f"state cannot be loaded: {reason}") from error
+
+
+def _read_states(robots: list[dict[str, Any]], source: EpisodeSource) -> list[EpisodeState]:
+    """Check where the episodes of a state began."""
+    begins = []
+    for robot in robots:
+        left = check_count("left", robot["left"], least=0)
+        kept = world_of_name(str(robot["kept"])) if left else None
+        if left and kept is None:
+            raise ValueError(f"kept must name a generator's world, got {robot['kept']!r}")
+        if kept is not None:
+            source.check_world(kept)
+        begin = generator_at(robot["generator"]).bit_generator.state
+        begins.append(EpisodeState(begin, left, kept, given=False))
+    return begins
+
+
+def _read_speeds(values: Any, config: TaskConfig) -> NDArray[np.float64]:
+    """Check the wheel speeds of a robot's actions [m/s], ``[A, 2]``."""
+    speeds = np.array(values, dtype=np.float64).reshape(len(values), 2)
+    low, high = min(config.robot.wheel_limits.slow, 0.0), config.robot.wheel_limits.fast
+    most = math.ceil(config.max_steps / config.action_repeat)
+    # NaN is not above anything.
+    inside = (speeds > low - 1e-9) & (speeds < high + 1e-9)
+    if not inside.all() or len(speeds) > most:
+        raise ValueError(
+            f"speeds must be at most {most} pairs from {low} to {high} m/s, got {len(speeds)}, "
+            f"others of which are {speeds[~inside].tolist()}"
+        )
+    return speeds

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation_loops import observe_goals
+from mpfa_envs.sensing.observation import observe_goals
 from mpfa_envs.tasks.reward import payments_of
 from mpfa_envs.worlds.world import World
 

@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import WorldChoice
-    from mpfa_envs.scene.window import Window
+    from mpfa_envs.scene.scene import Window
     from mpfa_envs.sensing.lidar import Lidar
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
@@ -260,7 +259,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             return pictures[0]
         if self._window is None:
             # Imported here because it needs pygame.
-            from mpfa_envs.scene.window import Window
+            from mpfa_envs.scene.scene import Window
 
             self._window = Window(type(self).__name__, fps=self.metadata["render_fps"])
         self._window.show(pictures[0])

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.env.episodes import EpisodeSource
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 _KEYS: Final = ("reset_mask", "tasks", "worlds")
 

@@ -20,12 +20,11 @@ from mpfa_envs.env.step_loops import (
     measure_remaining,
     settle,
 )
-from mpfa_envs.paths.batch import FieldArrays
+from mpfa_envs.paths.distance import FieldArrays
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation import FLAGS, NUMBERS
-from mpfa_envs.sensing.observation_loops import lidar_pose, look_from, observe_all
+from mpfa_envs.sensing.observation import FLAGS, NUMBERS, lidar_pose, look_from, observe_all
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.arrays import grown
@@ -40,8 +39,7 @@ if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import Episode
     from mpfa_envs.sensing.lidar import Lidar
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 _TRAIL = 500
 """Time steps that trails have room for at first."""

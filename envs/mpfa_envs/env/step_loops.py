@@ -10,12 +10,12 @@ import numpy as np
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
 from mpfa_envs.tasks import reward
-from mpfa_envs.worlds.clearance_loops import clearance_at
+from mpfa_envs.worlds.arrays import clearance_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.paths.batch import FieldArrays
+    from mpfa_envs.paths.distance import FieldArrays
     from mpfa_envs.worlds.arrays import BatchArrays
 
 # Compiled here: the package's first import knows the function without Numba.

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from torchrl.data import TensorSpec
 
     from mpfa_envs.env.episodes import WorldChoice
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.world import World
+    from mpfa_envs.worlds.world import Task, World
 
 
 class NavigationTorchEnv(EnvBase):

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.config import TaskConfig, check_names
-from mpfa_envs.env.episodes import EpisodeSource, WorldChoice
+from mpfa_envs.env.episodes import EpisodeSource, WorldChoice, read_state, robot_to_plain
 from mpfa_envs.env.reset_options import (
     read_mask,
     read_reset_mask,
@@ -25,11 +25,9 @@ from mpfa_envs.env.reset_options import (
     spawn_generators,
 )
 from mpfa_envs.env.robots import RobotBatch
-from mpfa_envs.env.state import read_state, robot_to_plain
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

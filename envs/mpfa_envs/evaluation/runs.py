@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.deploy.maneuvers import stands_still
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, sct, spl
 from mpfa_envs.planners.dynamic_window import DynamicWindow
@@ -23,8 +24,7 @@ from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
-from mpfa_envs.robots.standing import stands_still
-from mpfa_envs.tasks.sets import WorldTask, world_tasks
+from mpfa_envs.tasks.sampling import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
 Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]

@@ -7,28 +7,35 @@ by construction (:func:`world_seed`).
 
 from __future__ import annotations
 
+import os
 import random
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean
-from mpfa_envs.generators.bars import bars
-from mpfa_envs.generators.clutter import clutter
-from mpfa_envs.generators.crowd import crowd
-from mpfa_envs.generators.fields import fields
-from mpfa_envs.generators.halls import halls
-from mpfa_envs.generators.mazes import mazes
-from mpfa_envs.generators.mixed import mixed
-from mpfa_envs.generators.rooms import rooms
+from mpfa_envs.generators.mazes import fields, mazes
+from mpfa_envs.generators.rooms import bars, clutter, crowd, halls, rooms
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
+from mpfa_envs.worlds.barn import barn_world
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.gazebo import load_gazebo_world
+from mpfa_envs.worlds.world import Task, World
+from mpfa_envs.worlds.world_file import load_world
+from mpfa_envs.worlds.yaml_nodes import KINDS
+
+_KINDS = (rooms, clutter, bars, fields, halls, mazes)
+
+
+def mixed(rng: random.Random, difficulty: float) -> World:
+    """Sample a world of one of the other generators, each as often."""
+    return rng.choice(_KINDS)(rng, difficulty)
+
 
 Generator: TypeAlias = Callable[[random.Random, float], World]
 """A function that samples a world of a difficulty in [0, 1]."""
@@ -128,7 +135,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
     Returns:
         The world, in which there is a task for a TurtleBot2 with 0.07 m to spare. It is called
         ``"bars-7"``, ``"bars-test-7"`` or, with a difficulty, ``"bars-7@0.5"``, which
-        :func:`~mpfa_envs.generators.resolve.resolve_world` understands.
+        :func:`~mpfa_envs.generators.generate.resolve_world` understands.
 
     Raises:
         TypeError: If a generator of your own gives something else.
@@ -257,3 +264,30 @@ def generator_tasks(
         rng = np.random.default_rng((_TASK_STREAM, kind, world_seed(split, index)))
         pairs += [(world, sample_task_on_grid(grid, rng)[0]) for _ in range(tasks)]
     return pairs
+
+
+_GAZEBO: Final = (".world", ".sdf", ".world.gz", ".sdf.gz")
+"""Endings of files that are read as Gazebo's."""
+
+
+def resolve_world(world: str | os.PathLike[str] | World) -> World:
+    """Find a world by name or read it from a file; a :class:`World` is returned as it is."""
+    if isinstance(world, World):
+        return world
+    if isinstance(world, str) and world in WORLDS:
+        return WORLDS[world]
+    if isinstance(world, str) and (number := re.fullmatch(r"barn-([0-9]|1[0-9])", world)):
+        return barn_world(int(number[1]))
+    if isinstance(world, str) and (generated := world_of_name(world)) is not None:
+        return generated
+    if isinstance(world, (str, os.PathLike)):
+        name = Path(world).name.lower()
+        if name.endswith((".yaml", ".yml")):
+            return load_world(world)
+        if name.endswith(_GAZEBO):
+            return load_gazebo_world(world)
+    hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
+    raise ValueError(
+        f"world must be a World, the path of {KINDS}, 'barn-0' to 'barn-19', a generator's "
+        f"'NAME-SEED' or one of {list(WORLDS)}, got {world!r}{hint}"
+    )

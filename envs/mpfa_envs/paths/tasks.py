@@ -12,8 +12,7 @@ from scipy.ndimage import find_objects, label
 
 from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.worlds.task import START_SLACK, Task
-from mpfa_envs.worlds.world import Box, World
+from mpfa_envs.worlds.world import START_SLACK, Box, Task, World
 
 LONGEST_PATH: Final = 20.0
 """Longest path of a sampled task in a wide world [m]: longer ones take longer than an episode."""

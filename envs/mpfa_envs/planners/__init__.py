@@ -9,10 +9,14 @@ from typing import Final
 from mpfa_envs.checks import check_choice, did_you_mean
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
-from mpfa_envs.planners.map_planner import MapPlanner
+from mpfa_envs.planners.map_planner import (
+    MapPlanner,
+    PurePursuit,
+    Search,
+    path_length,
+    shortest_path,
+)
 from mpfa_envs.planners.predictive import PredictiveControl
-from mpfa_envs.planners.pure_pursuit import PurePursuit
-from mpfa_envs.planners.search import Search, path_length, shortest_path
 from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.sensing.observation import Memory
 

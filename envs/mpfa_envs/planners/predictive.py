@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.checks import check_seed
-from mpfa_envs.paths.field_loops import path_lengths
-from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
 from mpfa_envs.planners.predictive_loops import CELL, Effort, Scene, best_plan, room_around
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import least_room, see

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpfa_envs.sensing.binning import Binning
+from mpfa_envs.sensing.observation import Binning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -5,19 +5,23 @@ Names that begin with ``render_`` give a picture from above, an array of shape
 matplotlib, which the extra ``pictures`` brings.
 """
 
-from mpfa_envs.render.animation import write_animation
 from mpfa_envs.render.charts import draw_seeds, plot_histograms, plot_seeds
-from mpfa_envs.render.film import Film, drive_episode, film_episode
-from mpfa_envs.render.grids import observe_room
-from mpfa_envs.render.samples import render_samples
-from mpfa_envs.render.traces import Panel, render_traces
+from mpfa_envs.render.film import (
+    Film,
+    Panel,
+    drive_episode,
+    film_episode,
+    render_traces,
+    write_animation,
+)
+from mpfa_envs.render.grids import observe_room, render_samples, render_values
 from mpfa_envs.render.trajectories import (
     Outcome,
     render_methods,
     render_trajectories,
     shown_episodes,
 )
-from mpfa_envs.render.values import render_values
+from mpfa_envs.scene.canvas import tiled
 from mpfa_envs.scene.colors import (
     FLOOR,
     GOAL,
@@ -30,7 +34,6 @@ from mpfa_envs.scene.colors import (
     viridis,
 )
 from mpfa_envs.scene.scene import render_scene
-from mpfa_envs.scene.tiles import tiled
 
 __all__ = [
     "FLOOR",

@@ -10,11 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.scene.canvas import Canvas, Point
+from mpfa_envs.generators.generate import resolve_world
+from mpfa_envs.scene.canvas import (
+    HEIGHT,
+    Canvas,
+    Entry,
+    Key,
+    Mark,
+    Point,
+    Title,
+    strip_width,
+    tiled,
+    titled,
+    write_strip,
+)
 from mpfa_envs.scene.colors import GOAL, GOAL_AREA, GOAL_EDGE, OUTCOMES, ROBOT_FRONT, TRAIL
-from mpfa_envs.scene.strip import HEIGHT, Entry, Key, Mark, Title, strip_width, titled, write_strip
-from mpfa_envs.scene.tiles import tiled
 from mpfa_envs.worlds.world import World
 
 Outcome = Literal["success", "collision", "timeout", "standstill"]

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpfa_envs.deploy.sectors import Scan
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.sensing.sectors import Scan
+from mpfa_envs.worlds.shapes import OccupancyGrid
 from mpfa_envs.worlds.world import World
 
 Pose = tuple[float, float, float]

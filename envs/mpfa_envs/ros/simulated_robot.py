@@ -9,11 +9,11 @@ import numpy as np
 
 from mpfa_envs.checks import check_choice, check_count, check_positive, check_seed
 from mpfa_envs.deploy.card import check_finite
-from mpfa_envs.deploy.sectors import Scan
-from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.robots.drives import Physics, make_drives
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.lidar import Lidar
+from mpfa_envs.sensing.sectors import Scan
 
 if TYPE_CHECKING:
     import os

@@ -22,7 +22,7 @@ from mpfa_envs.checks import (
     check_share,
 )
 from mpfa_envs.sensing.lidar_loops import cast_rays
-from mpfa_envs.sensing.observation_loops import sector_ranges
+from mpfa_envs.sensing.observation import sector_ranges
 from mpfa_envs.worlds.batch import WorldBatch
 
 if TYPE_CHECKING:

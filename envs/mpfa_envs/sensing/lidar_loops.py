@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.compiled import njit
-from mpfa_envs.worlds.cell_loops import cast_at_cells
+from mpfa_envs.worlds.arrays import cast_at_cells
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mpfa_envs.compiled import njit
-from mpfa_envs.worlds.clearance_loops import clearance_at
+from mpfa_envs.worlds.arrays import clearance_at
 from mpfa_envs.worlds.walker import HORIZON, PERSONAL_SPACE
 
 if TYPE_CHECKING:

@@ -27,8 +27,7 @@ from mpfa_envs.checks import check_count
 from mpfa_envs.files import cause_of, read_file
 from mpfa_envs.worlds.gazebo import read_gazebo_world
 from mpfa_envs.worlds.sdf import LARGEST_FILE
-from mpfa_envs.worlds.task import Task
-from mpfa_envs.worlds.world import Box, Cylinder, World
+from mpfa_envs.worlds.world import Box, Cylinder, Task, World
 from mpfa_envs.worlds.yaml_nodes import WorldFileError
 
 BARN_WORLDS: Final = tuple(range(5, 300, 15))

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mpfa_envs.worlds.arrays import BatchArrays, GridArrays, with_row
-from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import OccupancyGrid
 from mpfa_envs.worlds.world import World
 
 

@@ -13,15 +13,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs.worlds.sdf import Element, SdfFiles, read_sdf
-from mpfa_envs.worlds.solids import (
+from mpfa_envs.worlds.sdf import (
     STEP,
+    Element,
+    SdfFiles,
     Solid,
     box_of,
     cylinder_of,
     floor_of,
     plane_of,
     pose_matrix,
+    read_sdf,
     room_around,
 )
 from mpfa_envs.worlds.world import World

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mpfa_envs.files import cause_of, read_file
-from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
-from mpfa_envs.worlds.shapes import LARGEST_SIDE
+from mpfa_envs.worlds.shapes import LARGEST_SIDE, LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError
 
 Mode = Literal["trinary", "scale", "raw"]

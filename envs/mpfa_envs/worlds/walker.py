@@ -44,7 +44,7 @@ class Walker:
             waypoint to the next, after the last one to the first, from anywhere on this round; it
             walks through other walkers. Neither sees the robot. ``"orca"``: likewise between
             waypoints, no faster than its speed, around obstacles, other walkers and the robot
-            (:class:`~mpfa_envs.walkers.orca.OrcaRoom`), which needs
+            (:class:`~mpfa_envs.walkers.batch.OrcaRoom`), which needs
             ``pip install 'torchrl-mpfa[orca]'``.
         waypoints: Positions (x, y) between which walkers other than ``"straight"`` go [m], at least
             two.

@@ -1,4 +1,4 @@
-"""A world: a rectangular room with boxes, cylinders and polygons on its floor, and walkers."""
+"""A world: a rectangular room with obstacles on its floor and walkers; and a task in it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import all_finite, check_positive, plain
-from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
-from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Point, Polygon, Shape
+from mpfa_envs.worlds.shapes import (
+    LARGEST_SIDE,
+    LONGEST_SIDE,
+    MOST_CELLS,
+    Box,
+    Cylinder,
+    OccupancyGrid,
+    Point,
+    Polygon,
+    Shape,
+)
 from mpfa_envs.worlds.walker import MOST_WALKERS, Walker
 
 __all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
@@ -293,8 +302,7 @@ class World:
             and behind a wall.
         """
         # Imported here, and below, because they need Numba, which takes half a second.
-        from mpfa_envs.worlds.cell_loops import clearance_of_cells
-        from mpfa_envs.worlds.clearance_loops import clearance_of_shapes
+        from mpfa_envs.worlds.arrays import clearance_of_cells, clearance_of_shapes
 
         x, y = float(x), float(y)
         nearest = clearance_of_shapes(*self.arrays, x, y)
@@ -313,8 +321,7 @@ class World:
             Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall; zero in an
             occupied cell.
         """
-        from mpfa_envs.worlds.cell_loops import clearances_of_cells
-        from mpfa_envs.worlds.clearance_loops import clearances_of_shapes
+        from mpfa_envs.worlds.arrays import clearances_of_cells, clearances_of_shapes
 
         points = np.ascontiguousarray(points, dtype=np.float64)
         nearest = clearances_of_shapes(*self.arrays, points)
@@ -335,3 +342,16 @@ class World:
         """
         steps = math.ceil(math.dist(start, end) / _APART) + 1
         return float(self.clearances(np.linspace(start, end, steps)).min())
+
+
+START_SLACK = 0.15
+"""Clearance of a start beyond that of a collision [m]."""
+
+
+class Task(NamedTuple):
+    """One episode to drive; ``task._asdict()`` is what ``reset(options=...)`` takes."""
+
+    start: tuple[float, float, float]
+    """Pose (x, y, heading) [m, m, rad]."""
+    goal: tuple[float, float]
+    """Position (x, y) [m]."""

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
-from mpfa_envs.sensing.binning import Binning
+from mpfa_envs.sensing.observation import Binning
 from torchrl_mpfa import (
     DQN,
     ActorCritic,

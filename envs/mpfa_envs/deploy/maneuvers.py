@@ -1,15 +1,91 @@
-"""The end of a drive: when a robot is at its goal, how it slows down for it and turns there."""
+"""What a robot does without its policy: it arrives at its goal, or drives back where it stands."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from mpfa_envs.checks import check_number, check_positive
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
     from mpfa_envs.deploy.card import Card
     from mpfa_envs.robots.model import RobotModel
+
+STANDING_TIME: Final = 10.0
+"""A robot stands still that has not left a small square for this long [s]."""
+STANDING_SIDE: Final = 0.1
+"""Side of the square [m]."""
+
+
+def stands_still(places: Sequence[Sequence[float]] | NDArray[np.float64], period: float) -> bool:
+    """Return True if a robot has come nowhere of late, whether or not it turns.
+
+    Args:
+        places: Positions (x, y) so far, ``[T, 2]`` [m].
+        period: Time from one to the next [s].
+    """
+    count = math.ceil(STANDING_TIME / period) + 1
+    last = places[-count:]
+    return len(last) == count and bool((np.ptp(last, axis=0) <= STANDING_SIDE).all())
+
+
+_BACK: Final = 0.5
+"""Distance by which a robot that stands still drives back [m]."""
+_BACK_TIME: Final = 5.0
+"""Longest time for which it does so [s]."""
+_BACK_SPEED: Final = 0.3
+"""Share of its greatest speed with which it does so."""
+
+
+class WayBack:
+    """The places of a robot's decisions, and the way back of a robot that stands still."""
+
+    def __init__(
+        self,
+        robot: RobotModel,  # in whose speeds orders are given
+        period: float,  # from decision to decision [s]
+    ) -> None:
+        self._robot, self._period = robot, period
+        self._places: list[tuple[float, float]] = []
+        self._target: tuple[float, float] | None = None
+        self._since, self._stood = -math.inf, (0.0, 0.0)
+
+    @property
+    def stands_still(self) -> bool:
+        """True if the robot has come nowhere of late."""
+        return stands_still(self._places, self._period)
+
+    def speeds(
+        self, pose: tuple[float, float, float], time: float, *, reverses: bool
+    ) -> tuple[float, float] | None:
+        """Speeds of the wheels on the way back [m/s]; None: the policy decides."""
+        robot, (x, y, heading) = self._robot, pose
+        self._places.append((x, y))
+        waits = time - self._since >= STANDING_TIME
+        # Wheels that only turn forward cannot turn it on the spot, either.
+        if self._target is None and waits and robot.min_wheel_speed < 0.0 and self.stands_still:
+            # What it has driven it has seen. Near its start there is no place far enough away.
+            away = (place for place in reversed(self._places) if math.dist(place, (x, y)) >= _BACK)
+            farthest = max(self._places, key=lambda place: math.dist(place, (x, y)))
+            self._target, self._since, self._stood = next(away, farthest), time, (x, y)
+        driven = math.dist(self._stood, (x, y)) >= 0.8 * _BACK
+        if self._target is None or driven or time - self._since >= _BACK_TIME:
+            self._target = None
+            return None
+        bearing = math.atan2(self._target[1] - y, self._target[0] - x) - heading
+        ahead = math.cos(bearing) if reverses else 1.0
+        off = math.remainder(bearing, math.pi if reverses else math.tau)
+        # It turns first.
+        speed = _BACK_SPEED * robot.max_wheel_speed * max(math.cos(off), 0.0) ** 4
+        speed, turn = math.copysign(speed, ahead), 0.5 * math.sin(off) * robot.wheel_base
+        return speed - turn, speed + turn
+
 
 _FACING: Final = math.radians(5.0)
 """Error of the heading at a goal [rad]."""
