@@ -274,7 +274,7 @@ ENDS = [torch.uint8, torch.int64, torch.float32, torch.float64]
 
 
 @pytest.mark.parametrize(
-    ("kind", "method"), zip(ENDS, ["slices", "reaper", "her", "n-step"], strict=True)
+    ("kind", "method"), [*zip(ENDS, ["slices", "reaper", "her", "n-step"], strict=True)]
 )
 def test_ends_as_numbers_are_booleans_and_other_numbers_are_rejected_by_name(kind, method):
     def make():
