@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mpfa_envs import Walker, World, load_world, save_world
-from tests.envs.test_walkers import BUSY, ROUND, STANDING
+from tests.envs.busy import BUSY, ROUND, STANDING
 
 
 def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:
