@@ -121,6 +121,15 @@ def test_wheel_speeds_stay_in_the_window_and_their_range() -> None:
         assert min(chosen) >= 0.05 - 1e-6 and max(chosen) <= 0.5 + 1e-6
 
 
+def test_a_robot_whose_controller_limits_its_turn_turns_no_faster() -> None:
+    robot = replace(ROBOTS["kobuki"], turn_acceleration=1.0)
+    seen = np.zeros(DynamicWindow(robot=robot).observation_size, np.float32)
+    parts = observation_slices(36)
+    seen[parts["lidar"]], seen[parts["goal_direction"]] = 0.02, (0.0, 1.0)
+    left, right = robot.wheel_speeds(DynamicWindow(robot=robot)(seen))
+    assert abs(right - left) / robot.wheel_base <= 0.2 + 1e-6
+
+
 def test_in_the_open_it_turns_and_drives_to_the_goal() -> None:
     window = DynamicWindow()
     left, right = speeds(window(observation(goal=(3.0, 0.0), left=0.5, right=0.5)))

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from mpfa_envs import Walker, World, load_world, save_world
-from tests.envs.busy import BUSY, STANDING
-from tests.envs.test_walkers import ROUND
+from tests.envs.busy import BUSY, ROUND, STANDING
 
 
 def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:

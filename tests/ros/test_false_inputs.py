@@ -138,6 +138,17 @@ def test_the_message_of_a_hiding_ray_says_what_helps() -> None:
     )
 
 
+@pytest.mark.parametrize(("x", "more"), [(0.0, "0.22"), (0.1, "0.32"), (-0.1, "0.22")])
+def test_a_ray_that_may_hide_something_is_answered_by_what_helps(x: float, more: str) -> None:
+    loop = Loop(pilot={"mount": (x, 0.0, 0.0)})
+    hiding = {"range_min": 0.45, "ranges": [3.0, math.nan] * 180}
+    order = loop.run(0.1, lambda scan, _: scan._replace(**hiding))
+    assert order is not None and order.reason == (
+        "a ray in front is not valid, and may hide what is nearer than range_min, 0.45 m: "
+        f"raise stop_distance by {more} m"
+    )
+
+
 def test_a_scan_that_repeats_itself_stops_it_until_it_changes() -> None:
     loop = Loop()
     loop.run(1.0)
