@@ -26,7 +26,7 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,15 +45,14 @@ from mpfa_envs import (
 )
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.resolve import resolve_robot
-from mpfa_envs.safety.filter import CLEARANCE
 from training import files
 from training.evaluating import (
+    Conditions,
     Drivable,
     add_filter,
     add_robot,
     check_physics,
     drive,
-    evaluation_folder,
     filtered,
     needs_filter,
     on_robot,
@@ -170,18 +169,29 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.loaded = load_driver(options)
         if options.filter is None:
             options.filter = needs_filter(options.loaded)
-        options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
-        check_physics(options.physics)
-        options.task = {
-            name: value
-            for name in ("plan", "goal_radius")
-            if (value := getattr(options, name)) is not None
-        }
-        TaskConfig(**options.loaded.env_arguments | options.task)
+        options.asked = conditions(options)
+        check_physics(options.asked.physics)
+        TaskConfig(**options.loaded.env_arguments | options.asked.task)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
     return options
+
+
+def conditions(options: argparse.Namespace) -> Conditions:
+    """The conditions of the evaluation that the command line asks for."""
+    task = {name: getattr(options, name) for name in ("plan", "goal_radius")}
+    return Conditions(
+        tuple(options.worlds),
+        options.physics or options.loaded.env_arguments.get("physics", "wheels"),
+        options.episodes,
+        options.seed,
+        options.noise,
+        options.latency,
+        options.filter,
+        options.robot,
+        {name: value for name, value in task.items() if value is not None},
+    )
 
 
 def read_noise(words: str) -> RobotNoise:
@@ -213,18 +223,10 @@ def name_of(options: argparse.Namespace) -> str:
 
 def output_folder(options: argparse.Namespace) -> Path:
     """Return the default folder of the results."""
-    name = evaluation_folder(
-        options.worlds,
-        options.physics,
-        seed=options.seed,
-        noise=options.noise,
-        latency=options.latency,
-        filtered=options.filter,
-        robot=options.robot if options.policy is None else None,
-        task=options.task,
-    )
-    policy = options.path
+    policy, name = options.path, options.asked.folder
     if policy is None:
+        # The robot of a planner is in the planner's name.
+        name = replace(options.asked, robot=None).folder
         return Path("runs") / files.short_name(f"evaluation-{name_of(options)}") / name
     if policy.is_dir():
         return policy / name
@@ -287,9 +289,7 @@ def critic(options: argparse.Namespace) -> Values | None:
     return values_of(learner, options.loaded, settings)
 
 
-def show_live(
-    driver: Drivable, options: argparse.Namespace, how: Mapping[str, Any]
-) -> pd.DataFrame:
+def show_live(driver: Drivable, options: argparse.Namespace) -> pd.DataFrame:
     """Show the episodes in a window, one after another; return how each ended."""
     import pandas as pd
 
@@ -297,7 +297,7 @@ def show_live(
 
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)
-    for end in watch(driver, tasks, **how):
+    for end in watch(driver, tasks, **options.asked.arguments):
         print(f"{end.world}: {end.outcome} after {end.time_s:.1f} s")
         rows.append(end._asdict())
     return pd.DataFrame(rows)
@@ -329,23 +329,13 @@ def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> It
             yield f"in wandb, too: {found}"
 
 
-def described(options: argparse.Namespace, asked: dict[str, Any]) -> dict[str, Any]:
+def described(options: argparse.Namespace) -> dict[str, Any]:
     """What an evaluation was of, for the file of its settings."""
-    policy = options.loaded
-    document: dict[str, Any] = {"words": options.worlds, **asked, **options.task}
-    if options.filter:
-        document["filter"] = {"clearance": CLEARANCE}
-    if options.noise is not None:
-        document["noise"] = asdict(options.noise)
-    if options.latency is not None:
-        document["latency"] = options.latency
-    if isinstance(policy, Policy):
-        document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
+    if isinstance(policy := options.loaded, Policy):
+        driver = {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
     else:
-        document |= {"policy": options.policy, "memory": options.memory}
-    if options.robot is not None:
-        document["robot"] = asdict(options.robot)
-    return document
+        driver = {"policy": options.policy, "memory": options.memory}
+    return options.asked.as_json() | driver
 
 
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
@@ -371,37 +361,40 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     if options.path is not None and options.path.is_dir():
         for sentence in warnings_of(options.path):
             print(f"warning: {sentence}")
-    driver: Drivable = filtered(policy, physics=options.physics) if options.filter else policy
+    asked: Conditions = options.asked
+    driver: Drivable = filtered(policy, physics=asked.physics) if asked.filtered else policy
     folder = options.output or output_folder(options)
-    physics = options.physics
-    asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
-    errors = {"noise": options.noise, "latency": options.latency}
-    how = {**errors, "physics": physics, **options.task}
     if options.live:
-        return show_live(driver, options, how)
+        return show_live(driver, options)
     with held(folder):
-        asked_for = {**errors, **asked, **options.task}
-        driven = drive(driver, options.names, progress=not options.no_pictures, **asked_for)
+        driven = drive(
+            driver,
+            options.names,
+            episodes=asked.episodes,
+            seed=asked.seed,
+            progress=not options.no_pictures,
+            **asked.arguments,
+        )
         results = [result for drives in driven for result in drives.results]
         rows = [
-            {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
+            {"world": world_name(world), "physics": asked.physics, **summary_row(drives.results)}
             for world, drives in zip(options.names, driven, strict=True)
         ]
         if not options.no_pictures:
-            write_pictures(driver, driven, folder, values=critic(options), **how)
+            write_pictures(driver, driven, folder, values=critic(options), **asked.arguments)
         if len(rows) > 1:
-            rows.append({"world": "total", "physics": physics, **summary_row(results)})
+            rows.append({"world": "total", "physics": asked.physics, **summary_row(results)})
         summary = pd.DataFrame(rows)
         write_table(summary, folder / "summary.csv")
         episodes = as_table(results, EpisodeResult)
-        episodes.insert(0, "physics", physics)
+        episodes.insert(0, "physics", asked.physics)
         write_table(episodes, folder / files.EPISODES)
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        document = described(options, asked)
-        write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-    print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
+        document = json.dumps(described(options), indent=2) + "\n"
+        write_text_atomically(document, folder / files.SETTINGS)
+    print(f"\n{name_of(options)}, physics: {asked.physics}\n{printed(summary)}")
     print(f"written: {folder}")
     if isinstance(policy, Policy) and options.path.is_dir():
         for line in logged(policy, options.path, folder, summary):
