@@ -49,8 +49,6 @@ from training import files
 from training.evaluating import (
     Conditions,
     Drivable,
-    add_filter,
-    add_robot,
     check_physics,
     drive,
     filtered,
@@ -60,7 +58,7 @@ from training.evaluating import (
     tasks_of,
 )
 from training.finished import warnings_of
-from training.plugins import add_plugin
+from training.options import add_filter, add_plugin, add_robot, check_least
 from training.worlds import parse_worlds, understood, world_name
 
 if TYPE_CHECKING:
@@ -155,10 +153,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--no-pictures", action="store_true", help="write only tables")
     options = parser.parse_args(arguments)
-    for name, least in (("episodes", 1), ("seed", 0)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            parser.error(f"--{name} must be at least {least}, got {value}")
+    check_least(parser, options, episodes=1, seed=0)
     if (options.path is None) == (options.policy is None):
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":

@@ -34,7 +34,8 @@ from mpfa_envs import (
 )
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
-from training.evaluating import add_robot, on_robot, tasks_of
+from training.evaluating import on_robot, tasks_of
+from training.options import add_robot
 from training.worlds import parse_worlds
 
 POLICY = "td3-rooms"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from argparse import ArgumentParser, BooleanOptionalAction
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, field
@@ -25,7 +24,7 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
 from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
-from mpfa_envs.robots.model import ROBOTS, RobotModel
+from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE
 from training.files import short_name
@@ -122,21 +121,6 @@ class Conditions:
         # An evaluation that is older than seeds had the first one.
         theirs = {"seed": 0, **settings}
         return all(theirs.get(name) == mine.get(name) for name in (*mine, *_AS_TRAINED))
-
-
-def add_robot(parser: ArgumentParser, whose: str) -> None:
-    """Add the option ``--robot``; ``whose`` says which robot is the default."""
-    parser.add_argument("--robot", help=f"{', '.join(ROBOTS)} or a YAML file (default: {whose})")
-
-
-def add_filter(parser: ArgumentParser) -> None:
-    """Add the options ``--filter`` and ``--no-filter``."""
-    parser.add_argument(
-        "--filter",
-        action=BooleanOptionalAction,
-        help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
-        "policies that had it in all of their training)",
-    )
 
 
 def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:

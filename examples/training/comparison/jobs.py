@@ -14,9 +14,9 @@ import pandas as pd
 from mpfa_envs import load_policy
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.options import EPISODES, WORLDS
 from training.evaluating import Conditions, needs_filter
 from training.finished import is_finished, read_json
+from training.options import EPISODES, WORLDS
 from training.plugins import plugin_words
 from training.records import read_table, write_table
 from training.settings.command_line import composed, parse_overrides
