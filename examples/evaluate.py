@@ -69,22 +69,17 @@ if TYPE_CHECKING:
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
     *("success", "collision", "timeout", "standstill", "spl", "sct", "time_s"),
-    *("path_length", "plan_s", "decision_s"),
+    *("path_length", "plan_s", "decision_s", "barn_score"),
 )
-_COLUMNS = {
+"""Columns that are in the file, too."""
+_FORMATS = {
     **dict.fromkeys(("success", "collision", "timeout", "standstill"), "{:.1%}"),
-    **dict.fromkeys(("spl", "sct"), "{:.3f}"),
+    **dict.fromkeys(("spl", "sct", "barn_score"), "{:.3f}"),
+    **{"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"},
+    **{"plan_ms": "{:.2f}", "decision_ms": "{:.2f}"},
+    **{"walker_distance": "{:.3f}", "intrusion_time": "{:.1f}", "time_to_collision": "{:.2f}"},
 }
-_BARN = {"barn_score": "{:.3f}"}
-"""Columns of the task of that benchmark."""
-_LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}
-_ENCOUNTERS = {
-    "walker_distance": "{:.3f}",
-    "intrusion_time": "{:.1f}",
-    "time_to_collision": "{:.2f}",
-}
-"""Columns of worlds where people walk."""
-_MILLISECONDS = {"plan_s": "{:.2f}", "decision_s": "{:.2f}"}
+"""Columns on the screen; a summary has those of BARN or of walkers where they are."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -233,11 +228,10 @@ def output_folder(options: argparse.Namespace) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_BARN, **_LENGTHS, **_MILLISECONDS, **_ENCOUNTERS}.items():
-        if name in summary:
-            shown, scale = (name, 1.0) if name not in _MILLISECONDS else (f"{name[:-2]}_ms", 1e3)
-            values = (scale * summary[name]).map(form.format)
-            table[shown] = values.where(summary[name].notna(), "")
+    shown = summary.assign(plan_ms=1e3 * summary["plan_s"], decision_ms=1e3 * summary["decision_s"])
+    for name, form in _FORMATS.items():
+        if name in shown:
+            table[name] = shown[name].map(form.format).where(shown[name].notna(), "")
     ends = zip(summary["success_low"], summary["success_high"], strict=True)
     table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
     return table.to_string(index=False)
@@ -248,7 +242,7 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     def entries(row: Mapping[str, Any]) -> dict[str, Any]:
         # JSON has no NaN, which the time is where no episode succeeds.
-        values = ((name, float(row[name])) for name in (*_DOCUMENTED, *_BARN) if name in row)
+        values = ((name, float(row[name])) for name in _DOCUMENTED if name in row)
         kept = {name: None if math.isnan(value) else value for name, value in values}
         return {"episodes": int(row["episodes"]), **kept}
 
