@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.study import read_curves
 from mpfa_envs import (
     Policy,
     WorldTask,
@@ -46,7 +47,6 @@ from torchrl_mpfa import (
 from training.evaluating import Drivable, drive, filtered
 from training.files import run_script
 from training.pictures import Values, longest, trajectories_of
-from training.records import read_table
 from training.run.checkpoints import load_learner, read_checkpoint
 from training.run.evaluations import values_of
 from training.run.updates import ReplayHistory
@@ -235,13 +235,9 @@ def curves(output: Path) -> None:
     names = {"mpfa_per": "MPFA-PER", "per": "PER", "uniform": "uniform replay"}
     figure, axes = new_figure(1, 2, panel=(3.6, 3.0), sharey=True)
     for axis, (table, reward, title) in zip(axes, _LEARNED, strict=True):
-        rows = read_table(ROOT / f"docs/results/study/{table}-curves.csv.gz")
-        found: dict[str, list[Any]] = {name: [] for name in names.values()}
-        for (arm, _), each in rows.groupby(["arm", "seed"], sort=False):
-            comparison, learner, method, *other = str(arm).split("/")
-            if (comparison, learner) == (reward, "td3") and method in names and not other:
-                found[names[method]].append((each["total_steps"], each["success"]))
-        draw_seeds(axis, found, limits=(0.0, 1.0))
+        curves = read_curves(table)
+        runs = {name: curves[f"{reward}/td3/{method}"] for method, name in names.items()}
+        draw_seeds(axis, runs, limits=(0.0, 1.0))
         axis.set(title=title, xlabel="actions")
     axes[0].set_ylabel("goals reached in unseen rooms")
     finish(figure, axes, output / "curves.png", dpi=192)

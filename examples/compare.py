@@ -37,8 +37,8 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training import files
-from training.comparison.options import EPISODES, WORLDS, add_options
-from training.plugins import add_plugin, with_plugin
+from training.options import EPISODES, WORLDS, add_options, add_plugin, check_least
+from training.plugins import with_plugin
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -95,10 +95,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
                 parser.error(unknown(group, name, GROUPS[group]))
             if name in names[:number]:
                 parser.error(f"--{group}s has {name} twice")
-    for option in ("jobs", "episodes"):
-        value = getattr(options, option)
-        if value is not None and value < 1:
-            parser.error(f"--{option} must be at least 1, got {value}")
+    check_least(parser, options, jobs=1, episodes=1)
     from training.evaluating import check_physics
     from training.worlds import parse_worlds
 

@@ -26,7 +26,7 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,15 +45,12 @@ from mpfa_envs import (
 )
 from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.resolve import resolve_robot
-from mpfa_envs.safety.filter import CLEARANCE
 from training import files
 from training.evaluating import (
+    Conditions,
     Drivable,
-    add_filter,
-    add_robot,
     check_physics,
     drive,
-    evaluation_folder,
     filtered,
     needs_filter,
     on_robot,
@@ -61,7 +58,7 @@ from training.evaluating import (
     tasks_of,
 )
 from training.finished import warnings_of
-from training.plugins import add_plugin
+from training.options import add_filter, add_plugin, add_robot, check_least
 from training.worlds import parse_worlds, understood, world_name
 
 if TYPE_CHECKING:
@@ -72,22 +69,17 @@ if TYPE_CHECKING:
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (
     *("success", "collision", "timeout", "standstill", "spl", "sct", "time_s"),
-    *("path_length", "plan_s", "decision_s"),
+    *("path_length", "plan_s", "decision_s", "barn_score"),
 )
-_COLUMNS = {
+"""Columns that are in the file, too."""
+_FORMATS = {
     **dict.fromkeys(("success", "collision", "timeout", "standstill"), "{:.1%}"),
-    **dict.fromkeys(("spl", "sct"), "{:.3f}"),
+    **dict.fromkeys(("spl", "sct", "barn_score"), "{:.3f}"),
+    **{"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"},
+    **{"plan_ms": "{:.2f}", "decision_ms": "{:.2f}"},
+    **{"walker_distance": "{:.3f}", "intrusion_time": "{:.1f}", "time_to_collision": "{:.2f}"},
 }
-_BARN = {"barn_score": "{:.3f}"}
-"""Columns of the task of that benchmark."""
-_LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}
-_ENCOUNTERS = {
-    "walker_distance": "{:.3f}",
-    "intrusion_time": "{:.1f}",
-    "time_to_collision": "{:.2f}",
-}
-"""Columns of worlds where people walk."""
-_MILLISECONDS = {"plan_s": "{:.2f}", "decision_s": "{:.2f}"}
+"""Columns on the screen; a summary has those of BARN or of walkers where they are."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -156,10 +148,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--no-pictures", action="store_true", help="write only tables")
     options = parser.parse_args(arguments)
-    for name, least in (("episodes", 1), ("seed", 0)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            parser.error(f"--{name} must be at least {least}, got {value}")
+    check_least(parser, options, episodes=1, seed=0)
     if (options.path is None) == (options.policy is None):
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":
@@ -170,18 +159,29 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.loaded = load_driver(options)
         if options.filter is None:
             options.filter = needs_filter(options.loaded)
-        options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
-        check_physics(options.physics)
-        options.task = {
-            name: value
-            for name in ("plan", "goal_radius")
-            if (value := getattr(options, name)) is not None
-        }
-        TaskConfig(**options.loaded.env_arguments | options.task)
+        options.asked = conditions(options)
+        check_physics(options.asked.physics)
+        TaskConfig(**options.loaded.env_arguments | options.asked.task)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
     return options
+
+
+def conditions(options: argparse.Namespace) -> Conditions:
+    """The conditions of the evaluation that the command line asks for."""
+    task = {name: getattr(options, name) for name in ("plan", "goal_radius")}
+    return Conditions(
+        tuple(options.worlds),
+        options.physics or options.loaded.env_arguments.get("physics", "wheels"),
+        options.episodes,
+        options.seed,
+        options.noise,
+        options.latency,
+        options.filter,
+        options.robot,
+        {name: value for name, value in task.items() if value is not None},
+    )
 
 
 def read_noise(words: str) -> RobotNoise:
@@ -213,18 +213,10 @@ def name_of(options: argparse.Namespace) -> str:
 
 def output_folder(options: argparse.Namespace) -> Path:
     """Return the default folder of the results."""
-    name = evaluation_folder(
-        options.worlds,
-        options.physics,
-        seed=options.seed,
-        noise=options.noise,
-        latency=options.latency,
-        filtered=options.filter,
-        robot=options.robot if options.policy is None else None,
-        task=options.task,
-    )
-    policy = options.path
+    policy, name = options.path, options.asked.folder
     if policy is None:
+        # The robot of a planner is in the planner's name.
+        name = replace(options.asked, robot=None).folder
         return Path("runs") / files.short_name(f"evaluation-{name_of(options)}") / name
     if policy.is_dir():
         return policy / name
@@ -236,11 +228,10 @@ def output_folder(options: argparse.Namespace) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_BARN, **_LENGTHS, **_MILLISECONDS, **_ENCOUNTERS}.items():
-        if name in summary:
-            shown, scale = (name, 1.0) if name not in _MILLISECONDS else (f"{name[:-2]}_ms", 1e3)
-            values = (scale * summary[name]).map(form.format)
-            table[shown] = values.where(summary[name].notna(), "")
+    shown = summary.assign(plan_ms=1e3 * summary["plan_s"], decision_ms=1e3 * summary["decision_s"])
+    for name, form in _FORMATS.items():
+        if name in shown:
+            table[name] = shown[name].map(form.format).where(shown[name].notna(), "")
     ends = zip(summary["success_low"], summary["success_high"], strict=True)
     table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
     return table.to_string(index=False)
@@ -251,7 +242,7 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     def entries(row: Mapping[str, Any]) -> dict[str, Any]:
         # JSON has no NaN, which the time is where no episode succeeds.
-        values = ((name, float(row[name])) for name in (*_DOCUMENTED, *_BARN) if name in row)
+        values = ((name, float(row[name])) for name in _DOCUMENTED if name in row)
         kept = {name: None if math.isnan(value) else value for name, value in values}
         return {"episodes": int(row["episodes"]), **kept}
 
@@ -287,9 +278,7 @@ def critic(options: argparse.Namespace) -> Values | None:
     return values_of(learner, options.loaded, settings)
 
 
-def show_live(
-    driver: Drivable, options: argparse.Namespace, how: Mapping[str, Any]
-) -> pd.DataFrame:
+def show_live(driver: Drivable, options: argparse.Namespace) -> pd.DataFrame:
     """Show the episodes in a window, one after another; return how each ended."""
     import pandas as pd
 
@@ -297,7 +286,7 @@ def show_live(
 
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)
-    for end in watch(driver, tasks, **how):
+    for end in watch(driver, tasks, **options.asked.arguments):
         print(f"{end.world}: {end.outcome} after {end.time_s:.1f} s")
         rows.append(end._asdict())
     return pd.DataFrame(rows)
@@ -329,23 +318,13 @@ def logged(policy: Policy, run: Path, folder: Path, summary: pd.DataFrame) -> It
             yield f"in wandb, too: {found}"
 
 
-def described(options: argparse.Namespace, asked: dict[str, Any]) -> dict[str, Any]:
+def described(options: argparse.Namespace) -> dict[str, Any]:
     """What an evaluation was of, for the file of its settings."""
-    policy = options.loaded
-    document: dict[str, Any] = {"words": options.worlds, **asked, **options.task}
-    if options.filter:
-        document["filter"] = {"clearance": CLEARANCE}
-    if options.noise is not None:
-        document["noise"] = asdict(options.noise)
-    if options.latency is not None:
-        document["latency"] = options.latency
-    if isinstance(policy, Policy):
-        document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
+    if isinstance(policy := options.loaded, Policy):
+        driver = {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
     else:
-        document |= {"policy": options.policy, "memory": options.memory}
-    if options.robot is not None:
-        document["robot"] = asdict(options.robot)
-    return document
+        driver = {"policy": options.policy, "memory": options.memory}
+    return options.asked.as_json() | driver
 
 
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
@@ -371,37 +350,40 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     if options.path is not None and options.path.is_dir():
         for sentence in warnings_of(options.path):
             print(f"warning: {sentence}")
-    driver: Drivable = filtered(policy, physics=options.physics) if options.filter else policy
+    asked: Conditions = options.asked
+    driver: Drivable = filtered(policy, physics=asked.physics) if asked.filtered else policy
     folder = options.output or output_folder(options)
-    physics = options.physics
-    asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
-    errors = {"noise": options.noise, "latency": options.latency}
-    how = {**errors, "physics": physics, **options.task}
     if options.live:
-        return show_live(driver, options, how)
+        return show_live(driver, options)
     with held(folder):
-        asked_for = {**errors, **asked, **options.task}
-        driven = drive(driver, options.names, progress=not options.no_pictures, **asked_for)
+        driven = drive(
+            driver,
+            options.names,
+            episodes=asked.episodes,
+            seed=asked.seed,
+            progress=not options.no_pictures,
+            **asked.arguments,
+        )
         results = [result for drives in driven for result in drives.results]
         rows = [
-            {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
+            {"world": world_name(world), "physics": asked.physics, **summary_row(drives.results)}
             for world, drives in zip(options.names, driven, strict=True)
         ]
         if not options.no_pictures:
-            write_pictures(driver, driven, folder, values=critic(options), **how)
+            write_pictures(driver, driven, folder, values=critic(options), **asked.arguments)
         if len(rows) > 1:
-            rows.append({"world": "total", "physics": physics, **summary_row(results)})
+            rows.append({"world": "total", "physics": asked.physics, **summary_row(results)})
         summary = pd.DataFrame(rows)
         write_table(summary, folder / "summary.csv")
         episodes = as_table(results, EpisodeResult)
-        episodes.insert(0, "physics", physics)
+        episodes.insert(0, "physics", asked.physics)
         write_table(episodes, folder / files.EPISODES)
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        document = described(options, asked)
-        write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-    print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
+        document = json.dumps(described(options), indent=2) + "\n"
+        write_text_atomically(document, folder / files.SETTINGS)
+    print(f"\n{name_of(options)}, physics: {asked.physics}\n{printed(summary)}")
     print(f"written: {folder}")
     if isinstance(policy, Policy) and options.path.is_dir():
         for line in logged(policy, options.path, folder, summary):

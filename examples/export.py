@@ -28,7 +28,8 @@ from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
 from training import files
-from training.evaluating import Drivable, add_filter, add_robot, filtered, needs_filter, on_robot
+from training.evaluating import Drivable, filtered, needs_filter, on_robot
+from training.options import add_filter, add_robot, check_least
 
 TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""
@@ -54,8 +55,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--episodes", type=int, default=100, help="tasks that both drive; 0: none (default: 100)"
     )
     options = parser.parse_args(arguments)
-    if options.episodes < 0:
-        parser.error(f"--episodes must be at least 0, got {options.episodes}")
+    check_least(parser, options, episodes=0)
     try:
         options.robot = options.robot and resolve_robot(options.robot)
         options.policy = on_robot(load_policy(options.path), options.robot)

@@ -33,7 +33,8 @@ from mpfa_envs import (
     load_policy,
 )
 from mpfa_envs.scene.scene import Window, render_scene
-from training.evaluating import add_robot, on_robot, tasks_of
+from training.evaluating import on_robot, tasks_of
+from training.options import add_robot
 from training.worlds import parse_worlds
 
 POLICY = "td3-rooms"

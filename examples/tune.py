@@ -37,8 +37,8 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training import files
-from training.comparison.options import add_options
-from training.plugins import add_plugin, with_plugin
+from training.options import add_options, add_plugin, check_least
+from training.plugins import with_plugin
 
 RANGES = Path(__file__).with_suffix(".yaml")
 FIRST_SEED = 3000
@@ -72,10 +72,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--sampler-seed", type=int, default=0, help="of what is suggested")
     add_options(parser, folder="runs/tune", what="trials")
     options = parser.parse_args(arguments)
-    for name, least in (("trials", 1), ("jobs", 1), ("sampler_seed", 0)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            parser.error(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
+    check_least(parser, options, trials=1, jobs=1, sampler_seed=0)
     for seed in options.seeds:
         if options.seeds.count(seed) > 1:
             parser.error(f"--seeds has {seed} twice")

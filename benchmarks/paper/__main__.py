@@ -25,6 +25,7 @@ from benchmarks.paper.rows import FOLDER, QUESTION, keep, keep_time, read_rows
 from benchmarks.paper.runs import BLOCKS, SEEDS, comparisons, question, without
 from training import files
 from training.comparison.execution import make_runs
+from training.options import check_least
 from training.settings.train import register
 
 TIMED = SEEDS[:3]
@@ -48,8 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, help="folder of the page (default: docs/results)")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     options = parser.parse_args(arguments)
-    if options.jobs < 1:
-        parser.error(f"--jobs must be at least 1, got {options.jobs}")
+    check_least(parser, options, jobs=1)
     rows = options.rows or (FOLDER if options.command == "page" else options.folder / "rows")
     try:
         for folder in (options.folder, rows, options.output or rows):

@@ -24,6 +24,7 @@ from benchmarks.values.report import missing, write_report
 from benchmarks.values.running import make_rows, read_rows
 from torchrl_mpfa.checks import unknown
 from training.files import run_script
+from training.options import check_least
 
 ROWS = "rows.csv"
 
@@ -43,9 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--folder", type=Path, default=FOLDER, help="of buffers, rows and page (default: docs)"
     )
     options = parser.parse_args(arguments)
-    for name in ("seeds", "jobs"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name} must be at least 1, got {getattr(options, name)}")
+    check_least(parser, options, seeds=1, jobs=1)
     for arm in options.arms:
         if arm not in ARMS:
             parser.error(unknown("arm", arm, ARMS))

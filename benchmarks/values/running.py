@@ -19,7 +19,7 @@ from tqdm import tqdm
 from benchmarks.values.arms import AGAINST, ARMS
 from benchmarks.values.frozen import FrozenBuffer, frozen_buffers
 from benchmarks.values.learning import Measure, ReplayFunction, SignalFunction, learn
-from benchmarks.values.statistics import differences
+from benchmarks.values.report import differences
 from torchrl_mpfa.methods import Method
 from torchrl_mpfa.saving import write_text_atomically
 
@@ -45,7 +45,7 @@ def compare(
         against: Name of the method that the others are compared with; one of ``methods``.
 
     Returns:
-        A row for each of the others, see :func:`~benchmarks.values.statistics.differences`.
+        A row for each of the others, see :func:`~benchmarks.values.report.differences`.
 
     Raises:
         ValueError: If ``against`` is not among the methods.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, BooleanOptionalAction
+import json
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from itertools import accumulate
-from types import MappingProxyType
 from typing import Any
 
 from mpfa_envs import (
@@ -25,11 +24,14 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
 from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
-from mpfa_envs.robots.model import ROBOTS, RobotModel
+from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.safety.filter import CLEARANCE
 from training.files import short_name
 from training.worlds import worlds_label
 
+_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot")
+"""Conditions that an evaluation has no entry of where they are as in the training."""
 Drivable = Policy | MapPlanner | DynamicWindow | PredictiveControl | Filtered
 """Drivers of a robot, with the ``env_arguments`` that they need."""
 
@@ -57,50 +59,68 @@ def check_physics(physics: str) -> None:
             raise ValueError(str(error)) from error
 
 
-def evaluation_folder(
-    words: Sequence[str],
-    physics: str,
-    *,
-    seed: int = 0,
-    noise: RobotNoise | None = None,
-    latency: float | None = None,
-    filtered: bool = False,
-    robot: RobotModel | None = None,
-    task: Mapping[str, Any] = MappingProxyType({}),
-) -> str:
-    """Name of the folder of an evaluation: each choice has its own.
+@dataclass(frozen=True)
+class Conditions:
+    """Worlds, tasks, physics and errors of an evaluation: its folder and its settings name them."""
 
-    Examples:
-        >>> evaluation_folder(["test", "bars:test"], "wheels", noise=RobotNoise(slip=0.1))
-        'evaluation-test+bars-test-wheels-slip0.1'
-    """
-    errors = {**({} if noise is None else asdict(noise)), "latency": latency}
-    name = "".join(
-        [
-            f"evaluation-{worlds_label(words)}-{physics}",
-            "-filter" if filtered else "",
-            f"-{robot.name}" if robot is not None else "",
-            *(f"-{name}-{value}" for name, value in task.items()),
-            f"-seed{seed}" if seed else "",
-            *(f"-{what}{value:g}" for what, value in errors.items() if value),
+    words: tuple[str, ...]
+    """Worlds, as on the command line."""
+    physics: str
+    """``wheels`` or ``kinematic``."""
+    episodes: int | None = None
+    seed: int = 0
+    noise: RobotNoise | None = None
+    latency: float | None = None
+    """Time from a scan to the moment at which the wheels take the order [s]."""
+    filtered: bool = False
+    robot: RobotModel | None = None
+    """Another robot than that of the training."""
+    task: Mapping[str, Any] = field(default_factory=dict)
+    """``plan`` and ``goal_radius``, where they are others than in the training."""
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of the results: each choice has its own.
+
+        Examples:
+            >>> Conditions(("test", "bars:test"), "wheels", noise=RobotNoise(slip=0.1)).folder
+            'evaluation-test+bars-test-wheels-slip0.1'
+        """
+        errors = {**(asdict(self.noise) if self.noise else {}), "latency": self.latency}
+        parts = [
+            f"evaluation-{worlds_label(self.words)}-{self.physics}",
+            "-filter" if self.filtered else "",
+            f"-{self.robot.name}" if self.robot is not None else "",
+            *(f"-{name}-{value}" for name, value in self.task.items()),
+            f"-seed{self.seed}" if self.seed else "",
+            *(f"-{name}{value:g}" for name, value in errors.items() if value),
         ]
-    )
-    return short_name(name)
+        return short_name("".join(parts))
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the environments."""
+        errors = {"noise": self.noise, "latency": self.latency}
+        return {**errors, "physics": self.physics, **self.task}
 
-def add_robot(parser: ArgumentParser, whose: str) -> None:
-    """Add the option ``--robot``; ``whose`` says which robot is the default."""
-    parser.add_argument("--robot", help=f"{', '.join(ROBOTS)} or a YAML file (default: {whose})")
+    def as_json(self) -> dict[str, Any]:
+        """Return the entries of ``settings.json``; what is as in the training has none."""
+        tasks = {"episodes": self.episodes, "seed": self.seed, "physics": self.physics}
+        others = {
+            "filter": {"clearance": CLEARANCE} if self.filtered else None,
+            "noise": self.noise and asdict(self.noise),
+            "latency": self.latency,
+            "robot": self.robot and asdict(self.robot),
+        }
+        document = {"words": list(self.words), **tasks, **self.task}
+        return document | {name: value for name, value in others.items() if value is not None}
 
-
-def add_filter(parser: ArgumentParser) -> None:
-    """Add the options ``--filter`` and ``--no-filter``."""
-    parser.add_argument(
-        "--filter",
-        action=BooleanOptionalAction,
-        help="let actions pass a filter that keeps the robot off what its lidar sees (default: for "
-        "policies that had it in all of their training)",
-    )
+    def are_of(self, settings: Mapping[str, Any]) -> bool:
+        """Return True if the ``settings.json`` of an evaluation has these conditions."""
+        mine = json.loads(json.dumps(self.as_json()))
+        # An evaluation that is older than seeds had the first one.
+        theirs = {"seed": 0, **settings}
+        return all(theirs.get(name) == mine.get(name) for name in (*mine, *_AS_TRAINED))
 
 
 def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:

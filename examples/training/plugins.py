@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import ArgumentParser
 from collections.abc import Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -62,23 +62,6 @@ def _check_methods() -> None:
     for name, method in METHODS.items():
         if method.name != ALIASES.get(name, name) and method.name != name:
             raise ValueError(f"METHODS[{name!r}] must have this name, got {method.name!r}")
-
-
-def add_plugin(parser: ArgumentParser) -> None:
-    """Add the option ``--plugin``, which is loaded while the command line is parsed."""
-
-    def loaded(text: str) -> str:
-        try:
-            return load_plugin(text)
-        except ValueError as error:
-            raise ArgumentTypeError(str(error)) from error
-
-    parser.add_argument(
-        "--plugin",
-        type=loaded,
-        metavar="FILE",
-        help="file with methods, signals, robots or generators of your own",
-    )
 
 
 def plugin_words(arguments: Iterable[str]) -> list[str]:

@@ -161,6 +161,7 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
     study = ["--output", str(job.results(asked))]
     others = (
         ["--seed", "3"], ["--noise", "slip=0.1"], ["--latency", "0.1"], ["--robot", "turtlebot2"],
+        ["--goal-radius", "0.5"],
     )  # fmt: skip
     evaluate.main(how)
     assert job.is_evaluated(asked)
@@ -168,7 +169,7 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
         evaluate.main([*how, *other])
         assert job.is_evaluated(asked)
     names = {path.name.removeprefix("evaluation-A-") for path in job.path.glob("evaluation-*")}
-    changed = {"seed3", "slip0.1", "latency0.1", "turtlebot2"}
+    changed = {"seed3", "slip0.1", "latency0.1", "turtlebot2", "goal_radius-0.5"}
     assert names == {"kinematic", *(f"kinematic-{each}" for each in changed)}
     for other in others:
         evaluate.main([*how, *other, *study])

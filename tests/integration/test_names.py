@@ -15,7 +15,7 @@ import report
 import tune
 from mpfa_envs import RobotNoise
 from training.comparison.jobs import Arm, Job
-from training.evaluating import evaluation_folder
+from training.evaluating import Conditions
 from training.files import check_folder, full_disk, run_script, short_name
 from training.settings.train import _one_folder
 
@@ -39,7 +39,8 @@ def test_folder_of_a_run_with_many_settings_has_a_short_name_of_its_own() -> Non
 
 def test_folder_of_an_evaluation_in_many_worlds_has_a_short_name() -> None:
     words = [f"rooms:{number}-{number}" for number in range(100, 160)]
-    names = {evaluation_folder(words, "wheels", noise=RobotNoise(slip=s)) for s in (0.1, 0.2)}
+    noises = (RobotNoise(slip=slip) for slip in (0.1, 0.2))
+    names = {Conditions(tuple(words), "wheels", noise=noise).folder for noise in noises}
     assert len(names) == 2
     assert max(len(name) for name in names) <= 240
 

@@ -14,9 +14,9 @@ from tqdm import tqdm
 from torchrl_mpfa import Stop
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
-from training.comparison.options import JOBS
 from training.comparison.workers import LocalWorker, Lost, Worker
 from training.inherited import forget_single_run
+from training.options import JOBS
 
 LOG = "output.log"
 """Output of the scripts, in the folder of a run."""

@@ -14,9 +14,9 @@ import pandas as pd
 from mpfa_envs import load_policy
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.options import EPISODES, WORLDS
-from training.evaluating import evaluation_folder, needs_filter
+from training.evaluating import Conditions, needs_filter
 from training.finished import is_finished, read_json
+from training.options import EPISODES, WORLDS
 from training.plugins import plugin_words
 from training.records import read_table, write_table
 from training.settings.command_line import composed, parse_overrides
@@ -208,11 +208,14 @@ class Job:
             return wanted.filtered
         return (self.path / files.POLICY).exists() and needs_filter(load_policy(self.path))
 
+    def conditions(self, wanted: Evaluation) -> Conditions:
+        """Return those of its evaluation: pairs of the first seed, robots without errors."""
+        physics, filtered = self.physics(wanted), self.filtered(wanted)
+        return Conditions(wanted.words, physics, wanted.episodes, filtered=filtered)
+
     def results(self, wanted: Evaluation) -> Path:
         """Return the folder of its evaluation."""
-        return self.path / evaluation_folder(
-            wanted.words, self.physics(wanted), filtered=self.filtered(wanted)
-        )
+        return self.path / self.conditions(wanted).folder
 
     def status(self) -> Mapping[str, Any]:
         """Return its progress; empty before its first episode."""
@@ -224,21 +227,15 @@ class Job:
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
         """Return True if its present policy was evaluated as wanted."""
-        found = read_json(self.results(wanted) / files.SETTINGS)
-        policy = self.path / files.POLICY
+        evaluated, policy = (
+            read_json(self.results(wanted) / files.SETTINGS),
+            self.path / files.POLICY,
+        )
         return (
             self.is_trained()
-            and found.get("episodes") == wanted.episodes
-            and found.get("words") == list(wanted.words)
-            and found.get("physics") == self.physics(wanted)
-            and ("filter" in found) == self.filtered(wanted)
-            # A comparison drives the pairs of the first seed, and its robots without errors.
-            and found.get("seed", 0) == 0
-            and found.get("noise") is None
-            and found.get("latency") is None
-            and found.get("robot") is None
+            and self.conditions(wanted).are_of(evaluated)
             and policy.exists()
-            and found.get("sha256") == files.digest(policy)
+            and evaluated.get("sha256") == files.digest(policy)
         )
 
     def differences(self, asked: TrainSettings) -> list[str]:

@@ -27,10 +27,10 @@ from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.execution import LOG, Commands, Work, workers_of
 from training.comparison.jobs import Arm, Job
-from training.comparison.options import JOBS
 from training.comparison.ranges import Ranges, as_lines, fixed_settings
 from training.comparison.workers import Worker
 from training.figures import plot_search
+from training.options import JOBS
 from training.records import area_under, read_table, write_table
 from training.settings.train import TrainSettings
 

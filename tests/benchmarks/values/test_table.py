@@ -16,9 +16,8 @@ from benchmarks.values.__main__ import main
 from benchmarks.values.arms import ARMS, PLANNED
 from benchmarks.values.frozen import FOLDER, frozen_buffers
 from benchmarks.values.learning import Measure, learn
-from benchmarks.values.report import page
+from benchmarks.values.report import differences, page
 from benchmarks.values.running import make_rows, read_rows
-from benchmarks.values.statistics import differences
 from torchrl_mpfa.methods import METHODS
 
 
