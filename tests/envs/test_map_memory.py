@@ -212,7 +212,7 @@ def test_the_path_leads_round_a_wall_however_long_that_is() -> None:
             path = scan(memory, lidar, (x, -1.0, heading), (-14.0, 1.0))
     path = scan(memory, lidar, (-14.0, -1.0, 0.0), (-14.0, 1.0))
     assert 55.0 < path[2] < 70.0
-    sketch = memory.sketch(0, -14.0, -1.0)
+    sketch = memory.known_map(0, -14.0, -1.0)
     places = np.rint((np.array(sketch.path) - memory.arrays.origins[0]) / RESOLUTION).astype(int)
     assert not sketch.blocked[places[:, 0], places[:, 1]].any()
 
@@ -253,7 +253,7 @@ def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     )
     env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
     memory = env.robots._batch.memory
-    sketch = memory.sketch(0, 0.0, 0.0)
+    sketch = memory.known_map(0, 0.0, 0.0)
     assert math.dist(sketch.path[0], (0.0, 0.0)) < 0.25
     assert math.dist(sketch.path[-1], (3.0, 0.0)) < 0.1
     steps = [math.dist(a, b) for a, b in zip(sketch.path, sketch.path[1:], strict=False)]

@@ -346,7 +346,7 @@ class TaskConfig:
         return observation_slices(sectors, memory=self.memory, history=self.history)
 
     def make_spaces(self, diagonal: float) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
-        """Make the spaces of one robot's observations and actions in rooms of a diagonal [m]."""
+        """Make the spaces of one robot's observations and actions in worlds of a diagonal [m]."""
         sectors = self.make_lidar().sectors
         low, high = observation_bounds(sectors, diagonal, memory=self.memory, history=self.history)
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)

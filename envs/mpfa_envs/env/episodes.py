@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """A built-in world's name, the path of a world file, or a world."""
 GENERATED_DIAGONAL: Final = 50.0
-"""No room of a generator is longer than this from corner to corner [m]."""
+"""No world of a generator is longer than this from corner to corner [m]."""
 _WORLDS: Final = 50
 """Worlds of a generator that are tried before an error is raised."""
 
@@ -45,7 +45,7 @@ class Episode(NamedTuple):
     """A task in its world, and the measure of its robot's progress."""
 
     world: World
-    """The room."""
+    """The world."""
     task: Task
     """Start and goal."""
     shortest_path: float
@@ -130,7 +130,7 @@ class EpisodeSource:
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
         self.diagonal = GENERATED_DIAGONAL
-        """Longest distance in the rooms [m]."""
+        """Longest distance in the worlds [m]."""
         diagonals = [self._sample(probe, rng).world.diagonal for probe in probes]
         if self._generator:
             self.rejected = 0
@@ -225,7 +225,7 @@ class EpisodeSource:
                 f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
             )
 
-    def room(self, robot: int, choice: WorldChoice | None) -> World:
+    def world(self, robot: int, choice: WorldChoice | None) -> World:
         """Look up the world that a robot is to drive in; None is the one that it always has."""
         world = self.fixed(robot) if choice is None else resolve_world(choice)
         if world is None:

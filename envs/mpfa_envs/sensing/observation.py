@@ -115,7 +115,7 @@ OBSERVATION: Final = observation_slices()
 def observation_bounds(
     sectors: int, diagonal: float, *, memory: Memory = "none", history: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and the greatest observation, ``[O]``, in a room with this diagonal [m]."""
+    """The least and the greatest observation, ``[O]``, in a world with this diagonal [m]."""
     low, high = [], []
     for name, part in observation_slices(sectors, memory=memory, history=history).items():
         width = part.stop - part.start
