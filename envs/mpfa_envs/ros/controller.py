@@ -90,16 +90,21 @@ class LaserInput:
             self.last = LaserReading(scan, time, fault=str(error))
             return
         repeated = self._repeats(scan, time, points, odometry)
+        self.last = LaserReading(
+            scan, self._since if repeated else time, *self._obstacles(scan, points), repeated
+        )
+
+    def _obstacles(self, scan: Scan, points: Points) -> tuple[float, float, str]:
+        """Least distances in front and behind [m], and why the robot cannot drive by them."""
         front = np.abs(points.angles) <= 0.5 * math.pi
         ahead, behind = (
             float(np.fmin.reduce(points.ranges[half], initial=math.inf)) for half in (front, ~front)
         )
         silent = np.isnan(points.ranges)
         fault = self._hidden(scan, 1.0) if silent[front].any() else ""
-        if silent[~front].any() and self._hidden(scan, -1.0):
-            behind = 0.0
-        when = self._since if repeated else time
-        self.last = LaserReading(scan, when, ahead, behind, fault, repeated)
+        # What a silent ray behind may hide could touch the robot.
+        hidden_behind = silent[~front].any() and self._hidden(scan, -1.0)
+        return ahead, 0.0 if hidden_behind else behind, fault
 
     def forget(self) -> None:
         """Stop comparing with earlier odometry."""

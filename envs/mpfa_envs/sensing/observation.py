@@ -147,9 +147,10 @@ def observe_all(
             continue
         seen, rays = observations[robot], ranges[robot]
         start = seen.shape[0] - sectors * history
-        # The last scan moves to the first place of the earlier ones, and these one place on.
-        for index in range(seen.shape[0] - 1, start - 1, -1):
-            seen[index] = seen[index - sectors] if index >= start + sectors else seen[index - start]
+        if history:
+            # The last scan moves to the first place of the earlier ones, and these one place on.
+            seen[start + sectors :] = seen[start:-sectors].copy()
+            seen[start : start + sectors] = seen[:sectors]
         for sector in range(sectors):
             nearest = _sector_range(rays, sector * count, count, median)
             seen[sector] = near / max(nearest, near)
