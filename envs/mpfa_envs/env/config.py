@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.spaces import Box as BoxSpace
 
 from mpfa_envs.checks import (
+    check_bool,
     check_choice,
     check_count,
     check_not_negative,
@@ -58,7 +59,7 @@ FARTHEST: Final = 105.0
 _MOST_STEPS: Final = 1_000_000
 """Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
-    "contact": partial(check_choice, kinds=Literal[True, False]),
+    "contact": check_bool,
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
     "plan": partial(check_choice, kinds=Knowledge),
@@ -363,7 +364,7 @@ class TaskConfig:
         described["robot"] = robot.pop("name")
         described.update(
             # The lidar is described below, as the task has it.
-            (f"robot.{name}", value and float(value))
+            (f"robot.{name}", None if value is None else float(value))
             for name, value in robot.items()
             if not name.startswith("lidar_") and name != "latency"
         )

@@ -189,9 +189,8 @@ class PurePursuit:
         candidates = window[: within[-1] + 1][::-1]
         clearances = self._line_clearances(x, y, candidates)
         # Beside the path it may be as narrow for the robot as it may be at all.
-        for least in (self.grid.distance, self.robot.radius + _RIM):
-            if (clearances >= least).any():
-                break
+        distances = self.grid.distance, self.robot.radius + _RIM
+        least = next((each for each in distances if (clearances >= each).any()), math.inf)
         return tuple(candidates[int((clearances >= least).argmax())].tolist())
 
     def _line_clearances(self, x: float, y: float, to: NDArray[np.float64]) -> NDArray[np.float32]:
