@@ -143,6 +143,13 @@ def check_choice(name: str, value: Any, kinds: Any) -> Any:
     return value
 
 
+def check_bool(name: str, value: Any) -> bool:
+    """True or False."""
+    if value not in (True, False):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def check_seed(value: Any) -> int:
     """An integer of any size that is not negative."""
     return check_count("seed", value, least=0, most=math.inf)

@@ -183,7 +183,7 @@ def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     )
     env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
     memory = env.robots._batch.memory
-    sketch = memory.sketch(0, 0.0, 0.0)
+    sketch = memory.known_map(0, 0.0, 0.0)
     assert math.dist(sketch.path[0], (0.0, 0.0)) < 0.25
     assert math.dist(sketch.path[-1], (3.0, 0.0)) < 0.1
     steps = [math.dist(a, b) for a, b in zip(sketch.path, sketch.path[1:], strict=False)]

@@ -26,7 +26,7 @@ from mpfa_envs.planners.predictive_loops import (
     CELL,
     ROOMY,
     Effort,
-    Scene,
+    PlanningState,
     best_plan,
     rollout,
     room_around,
@@ -46,7 +46,7 @@ POCKET = World(
 )
 
 
-def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> Scene:
+def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> PlanningState:
     """A robot that drives east with its goal ahead [m], and a wall before it at a distance [m]."""
     rooms = np.full((121, 121), ROOMY)
     kept, points = BODY.radius + BODY.clearance, np.empty((1, 0, 3))
@@ -57,7 +57,7 @@ def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> S
     lengths = np.abs(np.arange(200)[:, None] * 0.1 - 9.0 - goal) + np.zeros((1, 200))
     speeds, counts = np.array([[speed, speed]]), np.zeros(1, np.int64)
     levels, pose = np.zeros((200, 200), np.uint8), (9.0, 10.0, 0.0)
-    return Scene(
+    return PlanningState(
         pose, speeds, points, counts, -1.0, rooms[None], levels, lengths, (9.0 + goal, 10.0, 0.47)
     )
 
@@ -266,7 +266,7 @@ def test_a_robot_plans_from_where_its_odometry_places_it_and_behind_the_filter()
     scene = planner._scene(env, 0, seen[0])
     assert env.maps is not None
     place = np.array(scene.pose[:2]) + env.maps.origins[0]
-    assert math.dist(place, env.moments[0, 4:6]) < 1e-9 < math.dist(place, env.poses[0, :2])
+    assert math.dist(place, env.measurements[0, 4:6]) < 1e-9 < math.dist(place, env.poses[0, :2])
     assert scene.goal[2] == pytest.approx(0.94 * 0.3)
     kept = planner._keep
     calls: list[int] = []

@@ -54,7 +54,7 @@ def drive(env: VectorNavigationEnv, first: int, last: int) -> list[np.ndarray]:
 
 def shown(env: VectorNavigationEnv) -> list[np.ndarray]:
     walkers = [env.walkers(index) for index in range(env.num_envs)]
-    return [env.observations, env.motions, env.moments, *env.info_tables, *walkers]
+    return [env.observations, env.motions, env.measurements, *env.info_tables, *walkers]
 
 
 def same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:

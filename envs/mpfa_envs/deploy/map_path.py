@@ -82,7 +82,7 @@ class Plan(NamedTuple):
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Middle of the room in the frame of the odometry (x, y) [m]."""
+        """Middle of the world in the frame of the odometry (x, y) [m]."""
         x, y, heading = self.pose
         # A map of ROS has an origin of its own.
         cells = self.world.occupancy
@@ -92,7 +92,7 @@ class Plan(NamedTuple):
 
     @property
     def size(self) -> tuple[float, float]:
-        """Sides of the smallest room along the axes of the odometry that holds it [m]."""
+        """Sides of the smallest rectangle along the axes of the odometry that holds it [m]."""
         width, depth = self.world.size
         cosine, sine = abs(math.cos(self.pose[2])), abs(math.sin(self.pose[2]))
         return width * cosine + depth * sine, width * sine + depth * cosine
@@ -110,7 +110,7 @@ class MapPath:
     def __init__(self, card: Card) -> None:
         # Without Numba the loops would run, but a thousand times more slowly.
         import_module("numba")
-        # The rays come with each scan, and of the room only the size is known.
+        # The rays come with each scan, and of the world only the size is known.
         rays = {"angles": np.zeros(1), "mount": (0.0, 0.0)}
         lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
@@ -125,12 +125,12 @@ class MapPath:
     ) -> None:
         """Begin a map of a size around a place [m], empty or with what a plan knows."""
         self._center[:] = center
-        room: Any = SimpleNamespace(size=size)
+        extent: Any = SimpleNamespace(size=size)
         if plan is None:
-            self._memory.begin(0, room)
+            self._memory.begin(0, extent)
         else:
             x, y = np.subtract(plan.middle, center).tolist()
-            self._memory.begin(0, room, plan=plan.world, pose=(x, y, plan.pose[2]))
+            self._memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
 
     def look_again(self) -> None:
         """The goal has moved: no path to it is known."""

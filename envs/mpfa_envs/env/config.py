@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.spaces import Box as BoxSpace
 
 from mpfa_envs.checks import (
+    check_bool,
     check_choice,
     check_count,
     check_not_negative,
@@ -58,7 +59,7 @@ FARTHEST: Final = 105.0
 _MOST_STEPS: Final = 1_000_000
 """Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
-    "contact": partial(check_choice, kinds=Literal[True, False]),
+    "contact": check_bool,
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
     "plan": partial(check_choice, kinds=Knowledge),
@@ -346,7 +347,7 @@ class TaskConfig:
         return observation_slices(sectors, memory=self.memory, history=self.history)
 
     def make_spaces(self, diagonal: float) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
-        """Make the spaces of one robot's observations and actions in rooms of a diagonal [m]."""
+        """Make the spaces of one robot's observations and actions in worlds of a diagonal [m]."""
         sectors = self.make_lidar().sectors
         low, high = observation_bounds(sectors, diagonal, memory=self.memory, history=self.history)
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)
@@ -363,7 +364,7 @@ class TaskConfig:
         described["robot"] = robot.pop("name")
         described.update(
             # The lidar is described below, as the task has it.
-            (f"robot.{name}", value and float(value))
+            (f"robot.{name}", None if value is None else float(value))
             for name, value in robot.items()
             if not name.startswith("lidar_") and name != "latency"
         )

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """A built-in world's name, the path of a world file, or a world."""
 GENERATED_DIAGONAL: Final = 50.0
-"""No room of a generator is longer than this from corner to corner [m]."""
+"""No world of a generator is longer than this from corner to corner [m]."""
 _WORLDS: Final = 50
 """Worlds of a generator that are tried before an error is raised."""
 
@@ -45,7 +45,7 @@ class Episode(NamedTuple):
     """A task in its world, and the measure of its robot's progress."""
 
     world: World
-    """The room."""
+    """The world."""
     task: Task
     """Start and goal."""
     shortest_path: float
@@ -126,16 +126,17 @@ class EpisodeSource:
         self._left = [0] * robots
         self.begins: dict[int, EpisodeState] = {}
         """Where each robot's episode came from."""
-        # A world without any task fails here, before anything runs.
+        driven = fixed[:robots]
+        self.diagonal = max((each.diagonal for each in driven), default=GENERATED_DIAGONAL)
+        """Longest distance in the worlds [m]."""
+        self._check_there_are_tasks(driven)
+
+    def _check_there_are_tasks(self, worlds: Sequence[World]) -> None:
+        """Sample an episode in each world, or in one of the generator, before anything runs."""
         rng = np.random.default_rng(0)
-        probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
-        self.diagonal = GENERATED_DIAGONAL
-        """Longest distance in the rooms [m]."""
-        diagonals = [self._sample(probe, rng).world.diagonal for probe in probes]
-        if self._generator:
-            self.rejected = 0
-        else:
-            self.diagonal = max(diagonals)
+        for world in worlds or (None,):
+            self._sample(world, rng)
+        self.rejected = 0
 
     def sample(
         self,
@@ -145,28 +146,29 @@ class EpisodeSource:
         renewed: Iterable[int] = (),  # in a new world, as after a seed
     ) -> list[Episode]:
         """Sample the next episodes of some robots, or none if one of them has none."""
-        before = self.rejected, list(self._left), list(self._worlds)
+        sampled = copy.copy(self)
+        sampled._left, sampled._worlds = list(self._left), list(self._worlds)
         for robot in renewed:
-            self._left[robot] = 0
+            sampled._left[robot] = 0
         begins = {
             robot: EpisodeState(
                 rngs[robot].bit_generator.state,
-                self._left[robot],
-                self._worlds[robot] if self._generator else None,
+                sampled._left[robot],
+                sampled._worlds[robot] if self._generator else None,
                 given is not None and given[robot] is not None,
             )
             for robot in robots
         }
         try:
             episodes = [
-                self._sample_next(robot, rngs[robot], None if given is None else given[robot])
+                sampled._sample_next(robot, rngs[robot], None if given is None else given[robot])
                 for robot in robots
             ]
         except BaseException:
-            self.rejected, self._left, self._worlds = before
             for robot, begin in begins.items():
                 rngs[robot].bit_generator.state = begin.generator
             raise
+        self.rejected, self._left, self._worlds = sampled.rejected, sampled._left, sampled._worlds
         self.begins.update(begins)
         return episodes
 
@@ -225,7 +227,7 @@ class EpisodeSource:
                 f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
             )
 
-    def room(self, robot: int, choice: WorldChoice | None) -> World:
+    def world(self, robot: int, choice: WorldChoice | None) -> World:
         """Look up the world that a robot is to drive in; None is the one that it always has."""
         world = self.fixed(robot) if choice is None else resolve_world(choice)
         if world is None:

@@ -88,13 +88,13 @@ class GoalRelabeling:
             Transitions to one goal after the other, batch size ``[R]``; none to a goal that the
             robot was within the radius of when the episode began.
         """
-        moments = _joined(episode, "hindsight").numpy()
-        positions, motions = moments[:, :2], moments[:, 4:9]
+        measurements = _joined(episode, "hindsight").numpy()
+        positions, motions = measurements[:, :2], measurements[:, 4:9]
         goals = positions[steps.cpu().numpy() + 1]
         away = np.linalg.norm(goals[:, None] - positions, axis=2)
         ends = np.argmax(away <= self._config.goal_radius, axis=1)
         goals, ends = goals[ends > 0], ends[ends > 0]
-        paths = self._paths(moments, goals, ends)
+        paths = self._paths(measurements, goals, ends)
         before = np.concatenate([np.arange(end) for end in ends] or [np.arange(0)])
         of_goal = np.repeat(np.arange(len(ends)), ends)
         last = torch.from_numpy(np.cumsum(ends) - 1)
@@ -121,20 +121,22 @@ class GoalRelabeling:
         return rows
 
     def _paths(
-        self, moments: NDArray[np.float64], goals: NDArray[np.float64], ends: NDArray[np.int64]
+        self, measurements: NDArray[np.float64], goals: NDArray[np.float64], ends: NDArray[np.int64]
     ) -> NDArray[np.float64] | None:
         """Paths on the robot's map, ``[T + 1, K, 3]``: it is made once more, for each goal."""
         if self._config.memory != "map":
             return None
-        count, (width, depth) = len(goals), moments[0, 2:4].tolist()
+        count, (width, depth) = len(goals), measurements[0, 2:4].tolist()
         world = World(name="hindsight", size=(width, depth))
         memory = MapMemory(count, self._config.robot, self._lidar)
         for index in range(count):
             memory.begin(index, world)
-        paths = np.zeros((len(moments), count, 3))
+        paths = np.zeros((len(measurements), count, 3))
         for step in range(int(ends.max(initial=-1)) + 1):
             now, taken, scans = (
-                np.broadcast_to(moments[step, part], (count, moments[step, part].size)).copy()
+                np.broadcast_to(
+                    measurements[step, part], (count, measurements[step, part].size)
+                ).copy()
                 for part in (slice(4, 9), slice(9, 12), slice(12, None))
             )
             paths[step] = memory.remember(now, goals, scans, ends >= step, taken=taken)

@@ -243,7 +243,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         return observations[0], float(rewards[0]), terminated, truncated, _first(infos)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Render the room from above.
+        """Render the world from above.
 
         Returns:
             Picture of shape ``[H, W, 3]``, the longer side 480, or None without a render

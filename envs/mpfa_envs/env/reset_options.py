@@ -64,7 +64,7 @@ def read_tasks(
             found.append(None)
             continue
         try:
-            world = source.room(robot, choice)
+            world = source.world(robot, choice)
             found.append((world, None if task is None else source.check_task(world, *task)))
         except ValueError as error:
             raise ValueError(f"robot {robot}: {error}") from error

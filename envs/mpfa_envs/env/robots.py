@@ -213,11 +213,11 @@ class RobotBatch:
             table[last - counts[index] :, index] = speeds
         # All end at once: in a shared physics server, a robot that waited would roll on.
         for step in range(last + 1):
-            beginning, moving = counts == last - step, counts > last - step - 1
-            for index in np.flatnonzero(beginning).tolist():
+            starting, moving = counts == last - step, counts > last - step - 1
+            for index in np.flatnonzero(starting).tolist():
                 self.begin(index, episodes[index], rngs[index])
-            if beginning.any():
-                self.sense(beginning, rngs)
+            if starting.any():
+                self.sense(starting, rngs)
             if step == last:
                 break
             if (ended := moving & ~self.running).any():
@@ -272,10 +272,10 @@ class RobotBatch:
             self.observations,
         )
 
-    def moments(self) -> NDArray[np.float64]:
+    def measurements(self) -> NDArray[np.float64]:
         """Return the state that hindsight relabeling needs, ``[N, 12 + rays]``.
 
-        Position (x, y), the room's size, pose and speeds by odometry as observed, the pose where
+        Position (x, y), the world's size, pose and speeds by odometry as observed, the pose where
         the scan was taken, and the range of each ray [m, m/s, rad], of which a ray that met a
         walker has the greatest, as in the robot's map.
         """
@@ -325,7 +325,7 @@ class RobotBatch:
         return [(x, y) for x, y in rows.tolist()]
 
     def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
-        """Functions that render each robot's room as it is now from above, ``[H, W, 3]``."""
+        """Functions that render each robot's world as it is now from above, ``[H, W, 3]``."""
         # Imported here because training does not render.
         from mpfa_envs.scene.scene import render_scene
 
@@ -339,7 +339,7 @@ class RobotBatch:
                 goal_radius=self._config.goal_radius,
                 trail=self.trail(index),
                 rays=self._lidar.around_center(self.ranges[index].copy()),
-                sketch=None if self.memory is None else self.memory.sketch(index, x, y),
+                known_map=None if self.memory is None else self.memory.known_map(index, x, y),
                 walkers=self.walkers.of(index),
             )
             for index, (x, y, heading) in enumerate(self.episodes.motions[:, :3].tolist())

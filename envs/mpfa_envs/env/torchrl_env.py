@@ -43,7 +43,7 @@ class NavigationTorchEnv(EnvBase):
                                            ``INFO_TYPES``, bool or float32
     ``"hindsight"``              ``[M]``   float64, with ``hindsight=True``:
                                            what a goal in hindsight needs,
-                                           :attr:`VectorNavigationEnv.moments`
+                                           :attr:`VectorNavigationEnv.measurements`
     ============================ ========= =============================================
 
     All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``. ``reset(seed=3)``
@@ -146,7 +146,7 @@ class NavigationTorchEnv(EnvBase):
             start: Pose (x, y, heading) [m, m, rad].
             goal: Position (x, y) [m].
             index: Which robot of the batch.
-            world: The room of that episode; None: the one that the robot always drives in.
+            world: That of the episode; None: the one that the robot always drives in.
 
         Raises:
             IndexError: If there is no such robot.
@@ -228,7 +228,7 @@ class NavigationTorchEnv(EnvBase):
         shape = (*self.batch_size, observations.shape[1])
         rows: dict[str, Any] = {"observation": self._to_device(observations).view(shape), **entries}
         if self._hindsight:
-            rows["hindsight"] = self._to_device(self.env.moments).view(*self.batch_size, -1)
+            rows["hindsight"] = self._to_device(self.env.measurements).view(*self.batch_size, -1)
         if self._numbers or self._flags:
             flags, numbers = self.env.info_tables
             # Two tensors, split into entries: creating a tensor costs more than anything else here.

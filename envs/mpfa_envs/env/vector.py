@@ -175,9 +175,9 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         return self._batch.observations.copy()
 
     @property
-    def moments(self) -> NDArray[np.float64]:
+    def measurements(self) -> NDArray[np.float64]:
         """State that hindsight relabeling needs, ``[N, 12 + rays]`` [m, m/s, rad]."""
-        return self._batch.moments()
+        return self._batch.measurements()
 
     @property
     def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
@@ -203,16 +203,16 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
             index: Number of the robot.
             start: Pose (x, y, heading) [m, m, rad].
             goal: Position (x, y) [m].
-            world: The room; None: the one that the robot always drives in.
+            world: By name, file or object; None: the one that the robot always drives in.
 
         Returns:
-            The room and the task.
+            The world and the task.
 
         Raises:
             ValueError: If it cannot be driven.
         """
-        room = self._source.room(index, world)
-        return room, self._source.check_task(room, start, goal)
+        chosen = self._source.world(index, world)
+        return chosen, self._source.check_task(chosen, start, goal)
 
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m]."""
@@ -415,7 +415,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         self._rngs, self._seeded = rngs, {i: rng for i, rng in enumerate(seeded) if rng}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Render each robot's room from above.
+        """Render each robot's world from above.
 
         Returns:
             A picture for each robot, ``[H, W, 3]``, 480 the longer side; None without a mode.
@@ -428,7 +428,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         return tuple(snapshot() for snapshot in self.snapshots())
 
     def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
-        """Keep how each robot's room is now, to render it later or never.
+        """Keep how each robot's world is now, to render it later or never.
 
         Returns:
             A function for each robot, which gives the picture of :meth:`render`.

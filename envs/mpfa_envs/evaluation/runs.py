@@ -56,7 +56,7 @@ class Driver(Protocol):
         """
 
 
-class Blind:
+class ObservationDriver:
     """A policy as a :class:`Driver`, which sees the observations alone."""
 
     def __init__(self, policy: Action, *, alone: bool = False) -> None:
@@ -134,7 +134,7 @@ class Filtered:
 
 def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
     """A policy, or a driver, as a :class:`Driver`."""
-    return policy if isinstance(policy, Driver) else Blind(policy, alone=alone)
+    return policy if isinstance(policy, Driver) else ObservationDriver(policy, alone=alone)
 
 
 def evaluate(
@@ -306,13 +306,13 @@ def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
 
 
 def _room_for(worlds: Sequence[World]) -> World:
-    """An empty room of the largest width and depth, which bounds the observations."""
+    """An empty world of the largest width and depth, which bounds the observations."""
     sides = zip(*(world.size for world in worlds), strict=True)
     width, depth = (max(each) for each in sides)
     return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
 
 
-class FleetStep(NamedTuple):
+class Step(NamedTuple):
     """A decision of all robots that drive, before it is carried out, or the end of episodes."""
 
     observations: NDArray[np.float32]
@@ -327,7 +327,7 @@ class FleetStep(NamedTuple):
 
 def drive_steps(
     env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], numbers: Sequence[int]
-) -> Iterator[FleetStep]:
+) -> Iterator[Step]:
     """Drive the tasks of these numbers; give each decision, and each end of episodes."""
     worlds = Counter[int]()
     episodes = []
@@ -357,7 +357,7 @@ def drive_steps(
         actions[running] = driver.drive(env, robots, observations[running])
         decided[running] += (time.process_time() - start) / len(robots)
         decisions[running] += 1
-        yield FleetStep(observations, info, actions, [])
+        yield Step(observations, info, actions, [])
         observations, _, terminated, truncated, info = env.step(actions, only=running)
         ended = []
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
@@ -366,7 +366,7 @@ def drive_steps(
             result = _result(env, tasks[number], episodes[number], robot, info, *times)
             ended.append((robot, number, result))
         if ended:
-            yield FleetStep(observations, info, None, ended)
+            yield Step(observations, info, None, ended)
 
 
 def _begin(

@@ -38,7 +38,7 @@ from mpfa_envs.worlds.world import World
 RESOLUTION: Final = 0.1
 """Default side of a cell [m]."""
 MOST_CELLS: Final = 40_000_000
-"""Most cells of a grid, for rooms of up to 1,000 m x 1,000 m."""
+"""Most cells of a grid, for worlds of up to 1,000 m x 1,000 m."""
 MANY_CELLS: Final = 4_000_000
 """Where a grid would have more cells than this, longer cells are chosen if they are allowed."""
 _LARGE: Final = 100_000
@@ -48,10 +48,10 @@ _MARGIN: Final = 3
 
 
 class FreeGrid:
-    """Square cells over a room, some of them free for a disc's center.
+    """Square cells over a world, some of them free for a disc's center.
 
     Args:
-        world: The room and its obstacles.
+        world: Its walls and obstacles.
         distance: Least clearance of a free cell's center [m].
         resolution: Side of a cell [m], no longer than the distance, so that no move steps over a
             wall. None: 0.1 m, or the distance if that is less.
@@ -79,7 +79,7 @@ class FreeGrid:
             raise ValueError(
                 f"resolution must be at most the distance, {distance} m, got {resolution}"
             )
-        # The grid is as wide as the room or a little wider; cells behind a wall are not free.
+        # The grid is as wide as the world or a little wider; cells behind a wall are not free.
         sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
         if math.prod(sides) > MOST_CELLS:
             raise ValueError(
@@ -183,7 +183,7 @@ class FreeGrid:
         if not self.joins(start, goal):
             return math.inf
         direct = math.dist(start, goal)
-        # In a large room a window is searched first.
+        # In a large world a window is searched first.
         windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.free.size > _LARGE else ()
         for longest in windows:
             found = DistanceField(self, goal, longest, until=start).length_from(start)
@@ -309,7 +309,7 @@ def shortest_length(
     """Measure the shortest path of a disc [m]; infinite if there is none.
 
     A free straight line is measured exactly, and a path around obstacles over cells of 0.1 m, or of
-    0.02 m where those have no path; in a room of more than 40,000 m² cells are longer. The share
+    0.02 m where those have no path; in a world of more than 40,000 m² cells are longer. The share
     makes the cells of 0.1 m shorter.
     """
     fixed = _fixed_lengths(world.name) if radius == _FIXED_RADIUS else {}

@@ -117,7 +117,7 @@ def sample_task_on_grid(
 
 
 def is_wide(world: World) -> bool:
-    """Return True if sampled paths are limited: in maps, and in rooms with a side over 20 m."""
+    """Return True if sampled paths are limited: in maps, and in worlds with a side over 20 m."""
     return world.occupancy is not None or max(world.size) > LONGEST_PATH
 
 

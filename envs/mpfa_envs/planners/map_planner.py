@@ -187,12 +187,11 @@ class PurePursuit:
             return tuple(window[0].tolist())
         # From the farthest to the nearest of them.
         candidates = window[: within[-1] + 1][::-1]
-        rooms = self._line_clearances(x, y, candidates)
+        clearances = self._line_clearances(x, y, candidates)
         # Beside the path it may be as narrow for the robot as it may be at all.
-        for least in (self.grid.distance, self.robot.radius + _RIM):
-            if (rooms >= least).any():
-                break
-        return tuple(candidates[int((rooms >= least).argmax())].tolist())
+        distances = self.grid.distance, self.robot.radius + _RIM
+        least = next((each for each in distances if (clearances >= each).any()), math.inf)
+        return tuple(candidates[int((clearances >= least).argmax())].tolist())
 
     def _line_clearances(self, x: float, y: float, to: NDArray[np.float64]) -> NDArray[np.float32]:
         """Least clearance on the straight line to each point [m], ``[points]``."""
@@ -210,8 +209,10 @@ class PurePursuit:
         """Curvature nearest to the wanted one of an arc that is free for longest [1/m, m]."""
         cosine, sine = math.cos(heading), math.sin(heading)
         across, up = self._arcs[..., 0], self._arcs[..., 1]
-        rooms = self._clearances(x + across * cosine - up * sine, y + across * sine + up * cosine)
-        blocked = rooms < self.robot.radius + _RIM
+        clearances = self._clearances(
+            x + across * cosine - up * sine, y + across * sine + up * cosine
+        )
+        blocked = clearances < self.robot.radius + _RIM
         # An arc that is blocked nowhere is free for all of its steps.
         steps = np.where(blocked.any(axis=1), blocked.argmax(axis=1), blocked.shape[1])
         off = np.abs(self._curvatures - wanted)
@@ -281,7 +282,7 @@ class MapPlanner:
         search: Finds a path.
         robot: The robot.
         clearance: Least clearance of the robot's rim on a path [m].
-        resolution: Side of a cell of the grid [m], longer in rooms of more than 200 m.
+        resolution: Side of a cell of the grid [m], longer in worlds of more than 200 m.
         look_ahead: Of the :class:`~mpfa_envs.planners.PurePursuit` [m].
 
     Raises:
@@ -335,7 +336,7 @@ class MapPlanner:
 
     def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:
         """Positions of a path from start to goal [m], and the grid that it was found on."""
-        # In a room of more than 100 m the finest cells would be too many.
+        # In a world of more than 100 m the finest cells would be too many.
         least = 1.01 * math.sqrt(math.prod(world.size) / MANY_CELLS)
         coarse, fine = max(self.resolution, least), max(min(_FINE, self.resolution), least)
         for clearance, resolution in (

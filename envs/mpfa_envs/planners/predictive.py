@@ -10,7 +10,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_seed
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
-from mpfa_envs.planners.predictive_loops import CELL, Effort, Scene, best_plan, room_around
+from mpfa_envs.planners.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import least_room, see
 from mpfa_envs.sensing.map_loops import BLOCKED, cell_of
@@ -181,12 +181,12 @@ class PredictiveControl:
 
     def _scene(
         self, env: VectorNavigationEnv, robot: int, observation: NDArray[np.float32]
-    ) -> Scene:
+    ) -> PlanningState:
         """What a robot knows when it decides."""
         episode, maps = self._episodes[robot], _maps(env)
         columns, rows = episode.levels.shape
         levels, (left, low) = maps.levels[robot, :columns, :rows], maps.origins[robot].tolist()
-        x, y, heading = env.moments[robot, 4:7].tolist()
+        x, y, heading = env.measurements[robot, 4:7].tolist()
         pose = x - left, y - low, heading
         goal = episode.goal[0] - left, episode.goal[1] - low, self._radius
         seen = self._keep.seen(observation[None])
@@ -210,7 +210,7 @@ class PredictiveControl:
             )
         least = least_room(near, self._body)
         field = episode.levels, episode.lengths
-        return Scene(pose, seen[3], points, counts, least, self._rooms[None], *field, goal)
+        return PlanningState(pose, seen[3], points, counts, least, self._rooms[None], *field, goal)
 
     def _is_stuck(self, episode: _Episode, place: Point) -> bool:
         """Return True once if a robot has not left its place for a while."""

@@ -29,7 +29,7 @@ _SPREAD: Final = (0.45, 0.2, 0.08)
 """Spread of the sampled speeds in each round, over the fastest."""
 
 
-class Scene(NamedTuple):
+class PlanningState(NamedTuple):
     """What a robot knows when it decides; places are in meters from the first cell of its map."""
 
     pose: tuple[float, float, float]  # x, y, heading [m, m, rad]
@@ -73,11 +73,11 @@ def room_around(
 
 
 @njit
-def _room_at(scene: Scene, x: float, y: float) -> float:
+def _room_at(state: PlanningState, x: float, y: float) -> float:
     """Room at a place [m]."""
-    cells = scene.rooms.shape[1]
-    west, south = scene.pose[0] - cells // 2 * CELL, scene.pose[1] - cells // 2 * CELL
-    return interpolate(scene.rooms, 0, cells, cells, west, south, CELL, x, y)
+    cells = state.rooms.shape[1]
+    west, south = state.pose[0] - cells // 2 * CELL, state.pose[1] - cells // 2 * CELL
+    return interpolate(state.rooms, 0, cells, cells, west, south, CELL, x, y)
 
 
 @njit
@@ -120,7 +120,7 @@ def _terminal_cost(
 @njit
 def rollout(
     plan: NDArray[np.float64],  # wheel speeds of each time step [m/s], [T, 2]
-    scene: Scene,
+    state: PlanningState,
     body: Body,
     effort: Effort,
     most: float,  # [s]
@@ -132,15 +132,15 @@ def rollout(
     """
     limits, parts = body.limits, math.ceil(body.limits.fast * body.time_step / (1.2 * CELL))
     part = body.time_step / parts
-    left, right = scene.speeds[0, 0], scene.speeds[0, 1]
-    x, y, heading = scene.pose
+    left, right = state.speeds[0, 0], state.speeds[0, 1]
+    x, y, heading = state.pose
     # Between the cells, the room of the place where it stands may seem to be below zero.
-    needed, time = min(_room_at(scene, x, y), 0.0) - 1e-9, 0.0
+    needed, time = min(_room_at(state, x, y), 0.0) - 1e-9, 0.0
     step, last = 0, plan.shape[0]
     while True:
         if step == last:
             place = x, y, heading
-            time += _terminal_cost(scene.lengths, place, 0.5 * (left + right), body, effort)
+            time += _terminal_cost(state.lengths, place, 0.5 * (left + right), body, effort)
         if time >= most:
             return math.inf
         if step < last:
@@ -159,17 +159,17 @@ def rollout(
             x += along * math.cos(heading + 0.5 * turn)
             y += along * math.sin(heading + 0.5 * turn)
             heading += turn
-            room = _room_at(scene, x, y)
+            room = _room_at(state, x, y)
             if room < needed:
                 return math.inf
         if step < last:
             near = 1.0 - max(room, 0.0) / ROOMY
             time += body.time_step * (1.0 + near * near)
-            column = cell_of(x / RESOLUTION, scene.levels.shape[0])
+            column = cell_of(x / RESOLUTION, state.levels.shape[0])
             # A wall that the lidar does not see from here: the sectors show what is before it.
-            if scene.levels[column, cell_of(y / RESOLUTION, scene.levels.shape[1])] == BLOCKED:
+            if state.levels[column, cell_of(y / RESOLUTION, state.levels.shape[1])] == BLOCKED:
                 time += _WALL * body.time_step
-            if math.hypot(x - scene.goal[0], y - scene.goal[1]) <= scene.goal[2]:
+            if math.hypot(x - state.goal[0], y - state.goal[1]) <= state.goal[2]:
                 return time
         step += 1
 
@@ -179,7 +179,7 @@ def best_plan(
     plan: NDArray[np.float64],  # the last one; the best one is written here, [T, 2]
     pairs: NDArray[np.float64],  # speeds that are tried after one another [m/s], [K, 2]
     noise: NDArray[np.float64],  # [rounds, samples, 4, 2]
-    scene: Scene,
+    state: PlanningState,
     body: Body,
     effort: Effort,
 ) -> float:
@@ -189,12 +189,12 @@ def best_plan(
     # What was planned, from now on.
     trial[: steps - repeat], trial[steps - repeat :] = plan[repeat:], plan[-1]
     trial[:repeat] = trial[0]
-    best = _better(trial, chosen, math.inf, scene, body, effort)
+    best = _better(trial, chosen, math.inf, state, body, effort)
     turn = max(steps // 4, repeat)
     for first in range(pairs.shape[0]):
         for second in range(pairs.shape[0]):
             trial[:turn], trial[turn:] = pairs[first], pairs[second]
-            best = _better(trial, chosen, best, scene, body, effort)
+            best = _better(trial, chosen, best, state, body, effort)
     if best == math.inf:
         return best
     ends = max(steps // 8, repeat), 3 * steps // 8, 5 * steps // 8, steps
@@ -209,7 +209,7 @@ def best_plan(
                         speed = plan[step, wheel] + wide * noise[spread, sample, knot, wheel]
                         trial[step, wheel] = min(max(speed, limits.slow), limits.fast)
                 begin = max(begin, ends[knot])
-            best = _better(trial, chosen, best, scene, body, effort)
+            best = _better(trial, chosen, best, state, body, effort)
     plan[:] = chosen
     return best
 
@@ -219,7 +219,7 @@ def _better(
     trial: NDArray[np.float64],
     chosen: NDArray[np.float64],
     best: float,
-    scene: Scene,
+    state: PlanningState,
     body: Body,
     effort: Effort,
 ) -> float:
@@ -227,11 +227,11 @@ def _better(
     # A robot that stands sees the same again: to wait for a better plan must not be free.
     slow = 1.0 - min(max(abs(trial[0, 0]), abs(trial[0, 1])) / body.limits.fast, 1.0)
     waits = effort.stand * slow * slow
-    time = rollout(trial, scene, body, effort, best - waits) + waits
+    time = rollout(trial, state, body, effort, best - waits) + waits
     if time >= best:
         return best
     first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
-    if room_after(first, scene.speeds, scene.points, scene.counts, body) <= scene.least:
+    if room_after(first, state.speeds, state.points, state.counts, body) <= state.least:
         return best
     chosen[:] = trial
     return time

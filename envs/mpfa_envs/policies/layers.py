@@ -241,17 +241,17 @@ def _scale(module: Any, before: Sequence[Layer]) -> list[Layer]:
         levels = torch.cat((ends, torch.tensor([-near, near], dtype=torch.double))).unsqueeze(-1)
         with torch.no_grad():
             try:
-                found = copy.deepcopy(module).double()(levels.expand(7, size)).numpy()
+                outputs = copy.deepcopy(module).double()(levels.expand(7, size)).numpy()
             except (TypeError, RuntimeError, AttributeError):
-                found = np.empty(0)
-        if found.shape == (7, size):
-            slope = (found[6] - found[5]) / (2 * near)
-            scale = Scale(found[2].astype(np.float32), slope.astype(np.float32))
-            clip = Clip(found.min(0).astype(np.float32), found.max(0).astype(np.float32))
-            values = scale(levels.numpy())
-            if np.allclose(values, found, rtol=1e-5):
+                outputs = np.empty(0)
+        if outputs.shape == (7, size):
+            slope = (outputs[6] - outputs[5]) / (2 * near)
+            scale = Scale(outputs[2].astype(np.float32), slope.astype(np.float32))
+            clip = Clip(outputs.min(0).astype(np.float32), outputs.max(0).astype(np.float32))
+            scaled = scale(levels.numpy())
+            if np.allclose(scaled, outputs, rtol=1e-5):
                 return [scale]
-            if np.allclose(clip(values), found, rtol=1e-5):
+            if np.allclose(clip(scaled), outputs, rtol=1e-5):
                 return [scale, clip]
     raise ValueError(
         f"layers must be among {sorted(KINDS)} and Identity, or map a Tanh to the bounds of "

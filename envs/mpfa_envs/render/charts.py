@@ -280,15 +280,21 @@ def looks(
     A second arm of a method has the color of the method and another dash.
     """
     every, styles = list(names), dict[str, dict[str, str]]()
-    known = methods or {name: method for name in every if (method := _method_in(name))}
-    free = [look(place) for place in range(len(LINES) * len(_DASHES))]
-    # The looks of methods come before those that others may have.
-    first = {known[name]: name for name in reversed(every) if name in known}
-    for name in sorted(every, key=lambda name: (name not in known, name not in first.values())):
-        own = [METHODS[known[name]]] if name in known else []
-        options = [_style(color, dash) for color, dash in own]
-        options += [_style(color, dash) for color, _ in own for dash in _DASHES] or free
-        styles[name] = next((each for each in options if each not in styles.values()), options[0])
+    method_of = methods or {name: method for name in every if (method := _method_in(name))}
+
+    def choose(name: str, options: Sequence[dict[str, str]]) -> None:
+        if name not in styles:
+            free = (style for style in options if style not in styles.values())
+            styles[name] = next(free, options[0])
+
+    # The looks of methods come before those of second arms, and these before those of others.
+    arms = [name for name in every if name in method_of]
+    first_arms = {method_of[name]: name for name in reversed(arms)}.values()
+    for name in [arm for arm in arms if arm in first_arms] + arms:
+        color, dash = METHODS[method_of[name]]
+        choose(name, [_style(color, dash), *(_style(color, other) for other in _DASHES)])
+    for name in every:
+        choose(name, [look(place) for place in range(len(LINES) * len(_DASHES))])
     return {name: styles[name] for name in every}
 
 

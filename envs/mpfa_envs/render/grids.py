@@ -44,7 +44,7 @@ Heading = float | Literal["goal"]
 
 
 def cell_centers(world: World, spacing: float) -> Array:
-    """Centers (x, y) of square cells that fill a room, row by row from below [m], ``[N, 2]``."""
+    """Centers (x, y) of square cells that fill a world, row by row from below [m], ``[N, 2]``."""
     check_positive("spacing", spacing)
     room = world.room
     sides = []
@@ -63,7 +63,7 @@ def observe_room(
     spacing: float = 0.2,
     **env_arguments: Any,
 ) -> tuple[Array, NDArray[np.float32]]:
-    """Observations of a robot at places all over a room.
+    """Observations of a robot at places all over a world.
 
     Args:
         world: A name, the path of a YAML file or a world.
@@ -249,7 +249,7 @@ _ARROW_TIME = 1.0
 _CELL, _BETWEEN = 0.2, 0.6
 """Least side of a cell and least distance between two arrows [m]."""
 _CELL_PIXELS = 9
-"""Least side of a cell in larger rooms [px]: each cell takes time, the more the larger the room."""
+"""Least side of a cell in larger worlds [px]: each cell takes time."""
 
 
 def render_values(
@@ -266,7 +266,7 @@ def render_values(
     size: int = 480,
     **env_arguments: Any,
 ) -> NDArray[np.uint8]:
-    """Render a value and the actions of a policy all over a room, for one goal.
+    """Render a value and the actions of a policy all over a world, for one goal.
 
     In every cell stands a robot that has not moved; all face one direction. The cell has the color
     of its value, the scale leaves out the highest and lowest two per cent; an arrow is the path

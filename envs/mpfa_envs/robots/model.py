@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import MISSING, dataclass, fields
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from mpfa_envs.checks import (
-    check_choice,
+    check_bool,
     check_count,
     check_meant,
     check_not_negative,
@@ -116,7 +116,7 @@ class RobotModel:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
-        check_choice("reverse", self.reverse, Literal[True, False])
+        check_bool("reverse", self.reverse)
         if self.lidar_rays is not None:
             check_count("lidar_rays", self.lidar_rays)
         for field in fields(self)[1:]:

@@ -45,7 +45,7 @@ _GAP: Final = 0.5
 """Longest time between two odometries that counts [s]."""
 
 
-class Seen(NamedTuple):
+class LaserReading(NamedTuple):
     """The last scan."""
 
     scan: Scan
@@ -61,7 +61,7 @@ class Seen(NamedTuple):
     """True if the robot has moved, and this scan has not changed."""
 
 
-class Felt(NamedTuple):
+class Odometry(NamedTuple):
     """Odometry."""
 
     pose: Pose
@@ -69,37 +69,42 @@ class Felt(NamedTuple):
     time: float
 
 
-class Sight:
+class LaserInput:
     """The last scan, and whether it repeats the one before."""
 
     def __init__(self, pilot: Pilot, stop_distance: float) -> None:
         self._sectors = pilot.sectors
         self._free = pilot.robot.radius + stop_distance
-        self.last: Seen | None = None
+        self.last: LaserReading | None = None
         self._ranges: NDArray[np.float64] = np.empty(0)
         self._since = -math.inf
         self._from: Pose | None = None
 
-    def take(self, scan: Scan, time: float, track: Track) -> None:
+    def take(self, scan: Scan, time: float, odometry: OdometryInput) -> None:
         """Take a scan and its time [s]."""
         try:
             self._sectors.read(scan)
             points = self._sectors.around(scan)
         # ScanError, and what NumPy says of what is no array of numbers.
         except ValueError as error:
-            self.last = Seen(scan, time, fault=str(error))
+            self.last = LaserReading(scan, time, fault=str(error))
             return
-        repeated = self._repeats(scan, time, points, track)
+        repeated = self._repeats(scan, time, points, odometry)
+        self.last = LaserReading(
+            scan, self._since if repeated else time, *self._obstacles(scan, points), repeated
+        )
+
+    def _obstacles(self, scan: Scan, points: Points) -> tuple[float, float, str]:
+        """Least distances in front and behind [m], and why the robot cannot drive by them."""
         front = np.abs(points.angles) <= 0.5 * math.pi
         ahead, behind = (
             float(np.fmin.reduce(points.ranges[half], initial=math.inf)) for half in (front, ~front)
         )
         silent = np.isnan(points.ranges)
         fault = self._hidden(scan, 1.0) if silent[front].any() else ""
-        if silent[~front].any() and self._hidden(scan, -1.0):
-            behind = 0.0
-        when = self._since if repeated else time
-        self.last = Seen(scan, when, ahead, behind, fault, repeated)
+        # What a silent ray behind may hide could touch the robot.
+        hidden_behind = silent[~front].any() and self._hidden(scan, -1.0)
+        return ahead, 0.0 if hidden_behind else behind, fault
 
     def forget(self) -> None:
         """Stop comparing with earlier odometry."""
@@ -114,7 +119,7 @@ class Sight:
             return f"{'repeated' if self.last.repeated else 'stale'} scan: {age:.1f} s old"
         return self.last.fault
 
-    def _repeats(self, scan: Scan, time: float, points: Points, track: Track) -> bool:
+    def _repeats(self, scan: Scan, time: float, points: Points, odometry: OdometryInput) -> bool:
         """Return True if the robot has moved since the first scan with these numbers."""
         # Where nothing is in reach, scans are alike.
         # A copy, as the caller may reuse the array.
@@ -124,8 +129,8 @@ class Sight:
             self._ranges, self._since, self._from = ranges, time, None
             return False
         if self._from is None and time >= self._since + _LAG:
-            self._from = track.pose_at(time)
-        return track.last is not None and _moved(self._from, track.last.pose)
+            self._from = odometry.pose_at(time)
+        return odometry.last is not None and _moved(self._from, odometry.last.pose)
 
     def _hidden(self, scan: Scan, sign: float) -> str:
         """Why a ray in front, or behind with a sign of -1, that is not valid may hide something."""
@@ -140,42 +145,42 @@ class Sight:
         )
 
 
-class Track:
+class OdometryInput:
     """The odometry of the last second, or of ``memory`` if that is longer [s]."""
 
     def __init__(self, robot: RobotModel, memory: float) -> None:
         # Twice what the wheels can, turning on the spot.
         self._limits = 2.0 * robot.max_wheel_speed, 4.0 * robot.max_wheel_speed / robot.wheel_base
         self._memory = max(_MEMORY, memory)
-        self._past: deque[Felt] = deque()
+        self._past: deque[Odometry] = deque()
         self._pushed = 0.0
         self._from: Pose | None = None
         self._finite = True
-        self.last: Felt | None = None
+        self.last: Odometry | None = None
         """Of numbers that are finite."""
 
-    def take(self, felt: Felt, ordered: float) -> str:
+    def take(self, odometry: Odometry, ordered: float) -> str:
         """Take odometry and the last order [m/s]; return why its poses cannot be trusted."""
-        self._finite = all(map(math.isfinite, (*felt.pose, *felt.speeds, felt.time)))
+        self._finite = all(map(math.isfinite, (*odometry.pose, *odometry.speeds, odometry.time)))
         if not self._finite:
             return ""
-        self.last = felt
+        self.last = odometry
         if not self._past:
-            self._past.append(felt)
+            self._past.append(odometry)
             return ""
         before = self._past[-1]
         # Headings continue beyond half a turn, so that turns can be compared.
-        x, y, heading = felt.pose
+        x, y, heading = odometry.pose
         heading += math.tau * round((before.pose[2] - heading) / math.tau)
-        felt = felt._replace(pose=(x, y, heading))
-        back = felt.time < before.time
+        odometry = odometry._replace(pose=(x, y, heading))
+        back = odometry.time < before.time
         # The oldest, too: a slide of a little in each message is a jump as well.
         past = (before,) if back else (before, self._past[0])
-        lost = self._jump(felt, past) or self._stall(felt, ordered)
+        lost = self._jump(odometry, past) or self._stall(odometry, ordered)
         if lost or back:
             self._past.clear()
-        self._past.append(felt)
-        while self._past[0].time < felt.time - self._memory:
+        self._past.append(odometry)
+        while self._past[0].time < odometry.time - self._memory:
             self._past.popleft()
         return lost
 
@@ -209,7 +214,7 @@ class Track:
         """Pose at a time, between the two odometries around it; outside of all the last one."""
         if self.last is None:
             return None
-        later: Felt | None = None
+        later: Odometry | None = None
         for each in reversed(self._past):
             if later is not None and each.time <= time < later.time:
                 share = (time - each.time) / (later.time - each.time)
@@ -227,22 +232,25 @@ class Track:
         """Return True if they do not turn the robot by that in a time [s]."""
         return abs(turned) > self._limits[1] * passed + _SLACK[1]
 
-    def _jump(self, felt: Felt, past: tuple[Felt, ...]) -> str:
+    def _jump(self, odometry: Odometry, past: tuple[Odometry, ...]) -> str:
         """The jump of a pose that the wheels cannot make since earlier ones; empty without."""
         for each in past:
-            moved, turned = math.dist(felt.pose[:2], each.pose[:2]), felt.pose[2] - each.pose[2]
-            passed = max(felt.time - each.time, 0.0)
+            moved, turned = (
+                math.dist(odometry.pose[:2], each.pose[:2]),
+                odometry.pose[2] - each.pose[2],
+            )
+            passed = max(odometry.time - each.time, 0.0)
             if self._too_far(moved, passed):
                 return f"odometry jumped: {moved:.1f} m in {passed:.2f} s"
             if self._too_much(turned, passed):
                 return f"odometry jumped: {math.degrees(turned):.0f} degrees in {passed:.2f} s"
         return ""
 
-    def _stall(self, felt: Felt, ordered: float) -> str:
+    def _stall(self, odometry: Odometry, ordered: float) -> str:
         """Return the distance ordered while the robot stood; empty if it moves as ordered."""
-        self._pushed += abs(ordered) * min(max(felt.time - self._past[-1].time, 0.0), _GAP)
-        if not ordered or self._from is None or _moved(self._from, felt.pose):
-            self._pushed, self._from = 0.0, felt.pose
+        self._pushed += abs(ordered) * min(max(odometry.time - self._past[-1].time, 0.0), _GAP)
+        if not ordered or self._from is None or _moved(self._from, odometry.pose):
+            self._pushed, self._from = 0.0, odometry.pose
         if self._pushed <= _PUSHED:
             return ""
         return f"odometry stands still: ordered to drive {self._pushed:.1f} m"
@@ -292,8 +300,8 @@ class Controller:
         self.scan_timeout = check_positive("scan_timeout", scan_timeout)
         self.odometry_timeout = check_positive("odometry_timeout", odometry_timeout)
         self.check_period = check_positive("check_period", check_period)
-        self._sight = Sight(pilot, self.stop_distance)
-        self._track = Track(pilot.robot, scan_timeout)
+        self._laser = LaserInput(pilot, self.stop_distance)
+        self._odometry = OdometryInput(pilot.robot, scan_timeout)
         self._ordered = 0.0, 0.0
         self._ticked, self._passed = -math.inf, 0.0
         self._places: set[tuple[int, int]] = set()
@@ -307,13 +315,13 @@ class Controller:
 
     def see(self, scan: Scan, time: float) -> None:
         """Take a scan and its time [s]."""
-        self._sight.take(scan, time, self._track)
+        self._laser.take(scan, time, self._odometry)
 
     def feel(
         self, pose: tuple[float, float, float], speeds: tuple[float, float], time: float
     ) -> None:
         """Take odometry: pose (x, y, heading), forward and turning speed, time [m, rad, s]."""
-        lost = self._track.take(Felt(pose, speeds, time), self._ordered[0])
+        lost = self._odometry.take(Odometry(pose, speeds, time), self._ordered[0])
         if lost and self.pilot.goal is not None:
             self.aim(None, lost)
 
@@ -338,8 +346,8 @@ class Controller:
         self._idle, self._held = reason, ""
         self._places, self._lost = set(), 0.0
         # The goal is in the frame of the odometry from now on.
-        self._track.forget()
-        self._sight.forget()
+        self._odometry.forget()
+        self._laser.forget()
         self.pilot.stop()
         if goal is not None:
             try:
@@ -376,16 +384,16 @@ class Controller:
                 return None
             self._told = True
             return Order(0.0, 0.0, self._idle)
-        seen, felt = self._sight.last, self._track.last
+        reading, odometry = self._laser.last, self._odometry.last
         reason = (
             self._held
-            or self._sight.missing(now, self.scan_timeout)
-            or self._track.missing(now, self.odometry_timeout)
+            or self._laser.missing(now, self.scan_timeout)
+            or self._odometry.missing(now, self.odometry_timeout)
         )
-        if reason or seen is None or felt is None:
+        if reason or reading is None or odometry is None:
             self._command = None
             return Order(0.0, 0.0, reason)
-        if self.pilot.arrived(felt.pose):
+        if self.pilot.arrived(odometry.pose):
             self.aim(None, "arrived")
             return self._choose(now)
         if self._lost > _NOWHERE:
@@ -393,43 +401,43 @@ class Controller:
             self.aim(None, f"{reason}: time for {_NOWHERE:g} m, and no new place")
             return self._choose(now)
         try:
-            order = self._drive(seen, felt, now)
+            order = self._drive(reading, odometry, now)
         # Whatever the policy raises: a policy that has failed is not asked again.
         except Exception as error:
             self.aim(None, str(error) if isinstance(error, ValueError) else f"failed: {error!r}")
             return self._choose(now)
-        self._count(felt)
-        return self._unless_blocked(order, seen, now)
+        self._count(odometry)
+        return self._unless_blocked(order, reading, now)
 
-    def _unless_blocked(self, order: Order, seen: Seen, now: float) -> Order:
+    def _unless_blocked(self, order: Order, reading: LaserReading, now: float) -> Order:
         """The order, or its turn alone if it comes too near to something before the next check."""
-        nearest, sign = (seen.behind, -1.0) if order.linear < 0.0 else (seen.ahead, 1.0)
+        nearest, sign = (reading.behind, -1.0) if order.linear < 0.0 else (reading.ahead, 1.0)
         # A filter keeps off all that is measured.
         if self.pilot.has_filter and nearest > 0.0:
             return order
         clearance = nearest - self.pilot.robot.radius
-        fastest = max(sign * self._ordered[0], self._track.fastest(seen.time, sign), 0.0)
-        covered = fastest * (max(now - seen.time, 0.0) + self.check_period)
+        fastest = max(sign * self._ordered[0], self._odometry.fastest(reading.time, sign), 0.0)
+        covered = fastest * (max(now - reading.time, 0.0) + self.check_period)
         if clearance - covered > self.stop_distance:
             return order
         reason = f"obstacle: {max(clearance, 0.0):.2f} m from the rim"
         return Order(0.0, order.angular, reason)
 
-    def _drive(self, seen: Seen, felt: Felt, now: float) -> Order:
+    def _drive(self, reading: LaserReading, odometry: Odometry, now: float) -> Order:
         """The command that holds, or a new one where it is due."""
         due = self._decided + (1.0 - _EARLY) * self.pilot.period
         if self._command is None or not self._decided <= now < due:
-            taken = self._track.pose_at(seen.time)
-            age = max(now - felt.time, 0.0)
+            taken = self._odometry.pose_at(reading.time)
+            age = max(now - odometry.time, 0.0)
             self._command = self.pilot.decide(
-                seen.scan, felt.pose, felt.speeds, scan_pose=taken, time=now, age=age
+                reading.scan, odometry.pose, odometry.speeds, scan_pose=taken, time=now, age=age
             )
             self._decided = now
         return Order(*self.pilot.ramp(self._ordered, self._command[2:], self._passed), "driving")
 
-    def _count(self, felt: Felt) -> None:
+    def _count(self, odometry: Odometry) -> None:
         """Count how far the robot could have driven since it came to its last new place."""
-        place = round(felt.pose[0] / _PLACE), round(felt.pose[1] / _PLACE)
+        place = round(odometry.pose[0] / _PLACE), round(odometry.pose[1] / _PLACE)
         self._lost += self._passed * self.pilot.pace * self.pilot.card.robot.max_wheel_speed
         if place not in self._places:
             self._places.add(place)

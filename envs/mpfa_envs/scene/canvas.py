@@ -78,7 +78,7 @@ class Canvas:
                 self.line(leg, ROUND, 1.2)
 
     def obstacles(self, world: World) -> None:
-        """Draw the obstacles of a room."""
+        """Draw the obstacles of a world."""
         for box in world.boxes:
             self.rectangle(
                 box.x_min, box.y_min, box.x_max, box.y_max, fill=OBSTACLE, outline=OBSTACLE_EDGE

@@ -15,7 +15,7 @@ from mpfa_envs.checks import check_positive
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.scene.canvas import Canvas, Point
 from mpfa_envs.scene.colors import MET, PATH, RAY, RAY_AREA, RIVAL, TRAIL
-from mpfa_envs.sensing.map_memory import Sketch
+from mpfa_envs.sensing.map_memory import KnownMap
 from mpfa_envs.worlds.world import World
 
 
@@ -28,7 +28,7 @@ def render_scene(
     goal_radius: float,
     trail: Sequence[Point] = (),
     rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
-    sketch: Sketch | None = None,
+    known_map: KnownMap | None = None,
     walkers: NDArray[np.float64] | None = None,
     rival: tuple[tuple[float, float, float], Sequence[Point]] | None = None,
     size: int = 480,
@@ -36,17 +36,17 @@ def render_scene(
     """Render one moment of an episode.
 
     Args:
-        world: The room and its obstacles.
+        world: Its walls and obstacles.
         robot: The robot.
         pose: Pose of the robot (x, y, heading) [m, m, rad].
         goal: Position of the goal (x, y) [m].
         goal_radius: Distance that reaches the goal [m].
         trail: Its positions so far (x, y) [m].
         rays: Angles in the robot's frame [rad] and ranges [m] of its lidar.
-        sketch: The robot's map, if it makes one.
+        known_map: The robot's map, if it makes one.
         walkers: (x, y), the speeds in both directions and the radius [m, m/s] of each walker,
             ``[K, 5]``.
-        rival: Pose and trail of a second robot in the same room, in another color.
+        rival: Pose and trail of a second robot in the same world, in another color.
         size: Longer side of the picture [px].
 
     Returns:
@@ -66,9 +66,9 @@ def render_scene(
     """
     canvas = Canvas(world, size=size)
     x, y, heading = pose
-    if sketch is not None:
-        canvas.cells(sketch.blocked, sketch.resolution, MET)
-        canvas.line([(x, y), *sketch.path], PATH, 1.5)
+    if known_map is not None:
+        canvas.cells(known_map.blocked, known_map.resolution, MET)
+        canvas.line([(x, y), *known_map.path], PATH, 1.5)
     if rays is not None:
         ends = [
             (x + reach * math.cos(heading + angle), y + reach * math.sin(heading + angle))

@@ -51,7 +51,7 @@ class Lidar:
         reduction: ``"min"`` reports the nearest return of a sector, ``"median"`` the median, and
             ``"single"`` casts only the ray through the middle of the sector.
         max_range: A ray that meets nothing within this distance reports this distance [m]. The
-            default is a side of the built-in rooms.
+            default is a side of the built-in worlds.
         noise: Standard deviation of Gaussian noise on each ray [m].
         field_of_view: Angle from the first edge of the first sector to the last of the last one
             [deg], at most 360: of sectors of 10 degrees a whole turn has 36.
@@ -94,7 +94,7 @@ class Lidar:
         self.angles = ray_angles(self.field_of_view, rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
         self._directions = np.stack((np.cos(self.angles), np.sin(self.angles)))
-        self._rooms = WorldBatch([replace(world, walkers=())])
+        self._world = WorldBatch([replace(world, walkers=())])
 
     def cast(
         self,
@@ -115,22 +115,22 @@ class Lidar:
         Returns:
             Range of each ray [m], shape ``[rays]``; zero in an obstacle.
         """
-        rooms = self._rooms.arrays
+        worlds = self._world.arrays
         if moving is not None and len(moving):
-            standing = rooms.circles[:, : rooms.counts[0, 1]]
-            rooms = rooms._replace(
+            standing = worlds.circles[:, : worlds.counts[0, 1]]
+            worlds = worlds._replace(
                 circles=np.concatenate((standing, moving[None]), axis=1),
-                counts=np.add(rooms.counts, (0, len(moving), 0, 0)),
+                counts=np.add(worlds.counts, (0, len(moving), 0, 0)),
             )
         ranges = np.empty((1, self.angles.size))
-        self.cast_all(np.array([[x, y, heading]]), np.ones(1, dtype=np.bool_), rooms, ranges)
+        self.cast_all(np.array([[x, y, heading]]), np.ones(1, dtype=np.bool_), worlds, ranges)
         return ranges[0]
 
     def cast_all(
         self,
         motions: NDArray[np.float64],
         chosen: NDArray[np.bool_],
-        rooms: BatchArrays,
+        worlds: BatchArrays,
         ranges: NDArray[np.float64],
     ) -> None:
         """Measure every ray of many robots, without noise.
@@ -138,11 +138,11 @@ class Lidar:
         Args:
             motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
             chosen: Which robots look around, ``[N]``; the others' ranges stay.
-            rooms: The room of each robot.
+            worlds: That of each robot.
             ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
         """
         view, motions = math.radians(self.field_of_view), self.placed(motions)
-        cast_rays(motions, chosen, rooms, self._directions, view, self.max_range, ranges)
+        cast_rays(motions, chosen, worlds, self._directions, view, self.max_range, ranges)
 
     def placed(self, motions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses of the sensors of many robots, in the first three columns as for the robots."""

@@ -1,7 +1,7 @@
 """Lidar of many robots: each shape is intersected only with the rays that point at it.
 
-A room has tens or hundreds of shapes, and most are seen by a few rays or by none. The directions of
-a shape's two outermost points give the rays between them; only these are intersected with it, by
+A world has tens or hundreds of shapes, and most are seen by a few rays or by none. The directions
+of a shape's two outermost points give the rays between them; only these are intersected with it, by
 the formulas of :class:`mpfa_envs.Lidar`, to which a test holds them.
 """
 
@@ -38,7 +38,7 @@ def cast_rays(
 ) -> None:
     """Write the noise-free range of every ray of the chosen robots; zero in an obstacle."""
     rays = directions.shape[1]
-    # Directions (cosine, sine) of the rays in the room, and one over them.
+    # Directions (cosine, sine) of the rays in the world, and one over them.
     beams = np.empty((4, rays))
     for robot in range(motions.shape[0]):
         if not chosen[robot]:
@@ -77,7 +77,7 @@ def cast_rays(
 def _turn(
     ahead: tuple[float, float], directions: NDArray[np.float64], beams: NDArray[np.float64]
 ) -> None:
-    """Turn the rays with the robot: their directions in the room, and one over these."""
+    """Turn the rays with the robot: their directions in the world, and one over these."""
     cosine, sine = ahead
     for ray in range(directions.shape[1]):
         # A ray parallel to a wall: the tiny number turns 0 / 0 into 0 and changes no other value.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
 _MARGIN: Final = 5
-"""Cells around the room: where it ends is not known before a wall was seen."""
+"""Cells around the world: where it ends is not known before a wall was seen."""
 _BLOCKED: Final = -0.02
 """Clearance of the robot's rim at or below which a cell is blocked [m]. A cell holds places up to
 half its side farther from a wall than its middle: with 0 a door 0.1 m wider than the robot would be
@@ -31,11 +31,11 @@ _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
 
 
-class Sketch(NamedTuple):
+class KnownMap(NamedTuple):
     """A robot's map as a picture needs it."""
 
     blocked: NDArray[np.bool_]
-    """Where the robot's center cannot be, ``[columns, rows]`` of cells around the room's middle,
+    """Where the robot's center cannot be, ``[columns, rows]`` of cells around the world's middle,
     the first column at the left and the first row at the bottom."""
     path: list[tuple[float, float]]
     """Centers of the cells of its path to the goal, in order (x, y) [m]."""
@@ -53,7 +53,7 @@ class MapMemory:
     makes it costlier. Its direction is that of the farthest of its next cells, two meters away at
     most, to which a straight line is no narrower than its ends.
 
-    It knows of the room only the scans, entered at the poses that odometry gives, and its plan if
+    It knows of the world only the scans, entered at the poses that odometry gives, and its plan if
     it is given. Scans add what the plan does not have; what it has too much stays, at the cost of
     blocked cells.
 
@@ -105,7 +105,7 @@ class MapMemory:
             world: Room of its next episode, for whose ``size`` the map is made.
             plan: What is known: cells have the levels that hits on all of its obstacles and walls
                 would give them; None: nothing.
-            pose: Of the plan's origin in the room (x, y, heading) [m, m, rad].
+            pose: Of the plan's origin in the world (x, y, heading) [m, m, rad].
         """
         sides = [math.ceil(side / RESOLUTION) + 2 * _MARGIN for side in world.size]
         arrays = self.arrays
@@ -159,7 +159,7 @@ class MapMemory:
         remember(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
 
-    def sketch(self, index: int, x: float, y: float) -> Sketch:
+    def known_map(self, index: int, x: float, y: float) -> KnownMap:
         """Give a robot's map and its path from a position, for a picture.
 
         Args:
@@ -174,4 +174,4 @@ class MapMemory:
         u, v = (np.array((x, y)) - origin) / RESOLUTION
         path = follow_path(levels, costs, cell_of(u, columns), cell_of(v, rows))
         along = [(across, up) for across, up in (origin + RESOLUTION * path).tolist()]
-        return Sketch(levels == BLOCKED, along, RESOLUTION)
+        return KnownMap(levels == BLOCKED, along, RESOLUTION)

@@ -115,7 +115,7 @@ OBSERVATION: Final = observation_slices()
 def observation_bounds(
     sectors: int, diagonal: float, *, memory: Memory = "none", history: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and the greatest observation, ``[O]``, in a room with this diagonal [m]."""
+    """The least and the greatest observation, ``[O]``, in a world with this diagonal [m]."""
     low, high = [], []
     for name, part in observation_slices(sectors, memory=memory, history=history).items():
         width = part.stop - part.start
@@ -147,9 +147,10 @@ def observe_all(
             continue
         seen, rays = observations[robot], ranges[robot]
         start = seen.shape[0] - sectors * history
-        # The last scan moves to the first place of the earlier ones, and these one place on.
-        for index in range(seen.shape[0] - 1, start - 1, -1):
-            seen[index] = seen[index - sectors] if index >= start + sectors else seen[index - start]
+        if history:
+            # The last scan moves to the first place of the earlier ones, and these one place on.
+            seen[start + sectors :] = seen[start:-sectors].copy()
+            seen[start : start + sectors] = seen[:sectors]
         for sector in range(sectors):
             nearest = _sector_range(rays, sector * count, count, median)
             seen[sector] = near / max(nearest, near)

@@ -351,35 +351,38 @@ class Sectors:
     def _beside(self, index: int, rays: _Rays, points: Points) -> float:
         """Range of a sector in which no valid ray has met anything [m]."""
         middle, half = float(self._middles[index]), 0.5 * self._width
-        off = np.abs(_wrapped(rays.directions - middle))
-        degrees = round(math.degrees(middle))
         if not rays.cover(self._middles[index]):
-            if self.unseen is None:
-                reach = 0.5 * rays.step * (rays.valid.size - 1)
-                right, left = (math.degrees(rays.middle + end) for end in (-reach, reach))
-                raise ScanError(
-                    f"the scan does not reach the sector at {degrees} degrees, "
-                    f"its rays are from {right:.0f} to {left:.0f} degrees"
-                )
-            return min(self.unseen, self.card.max_range)
-        within = off <= half + _EDGE
-        own = rays.valid[within][self._index(rays.directions[within]) == index]
+            return self._beyond_the_rays(middle, rays)
+        within = np.abs(_wrapped(rays.directions - middle)) <= half + _EDGE
+        valid = rays.valid[within][self._index(rays.directions[within]) == index]
         # A sensor that is elsewhere sees near points in other directions.
-        moved = bool(own.any())
-        if points.angles.size and (moved or not own.size):
-            beside = np.abs(_wrapped(points.angles - middle))
-            nearest = int(beside.argmin())
-            if moved or beside[nearest] <= half + rays.step + _EDGE:
+        moved = bool(valid.any())
+        if points.angles.size and (moved or not valid.size):
+            distances = np.abs(_wrapped(points.angles - middle))
+            nearest = int(distances.argmin())
+            if moved or distances[nearest] <= half + rays.step + _EDGE:
                 return float(points.ranges[nearest])
         if self.silent == "reject":
+            degrees = round(math.degrees(middle))
             raise ScanError(f"no ray of the sector at {degrees} degrees is valid")
         return self.card.max_range
+
+    def _beyond_the_rays(self, middle: float, rays: _Rays) -> float:
+        """Range of a sector that no ray reaches [m]."""
+        if self.unseen is None:
+            reach = 0.5 * rays.step * (rays.valid.size - 1)
+            right, left = (math.degrees(rays.middle + end) for end in (-reach, reach))
+            raise ScanError(
+                f"the scan does not reach the sector at {round(math.degrees(middle))} degrees, "
+                f"its rays are from {right:.0f} to {left:.0f} degrees"
+            )
+        return min(self.unseen, self.card.max_range)
 
 
 def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles in [-π, π) [rad]."""
-    found: NDArray[np.float64] = (angles + math.pi) % (2.0 * math.pi) - math.pi
-    return found
+    wrapped: NDArray[np.float64] = (angles + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped
 
 
 _REDUCED: Final = 3

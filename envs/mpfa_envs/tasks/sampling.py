@@ -105,11 +105,11 @@ def sample_task(
     """Sample a start and a goal uniformly over the free space of their regions.
 
     The two are joined by a path that keeps the collision distance, so every task can be solved.
-    Tasks in maps, in wide rooms (:func:`~mpfa_envs.paths.tasks.is_wide`) and in rooms too narrow
+    Tasks in maps, in wide worlds (:func:`~mpfa_envs.paths.tasks.is_wide`) and in those too narrow
     for the usual distance of goals are those of :func:`~mpfa_envs.paths.tasks.sample_task_on_grid`.
 
     Args:
-        world: The room, its obstacles and its regions.
+        world: Its walls, obstacles and its regions.
         rng: Source of randomness.
         collision_distance: Distance of the center from an obstacle that is a collision [m].
         min_goal_distance: Least distance between start and goal [m].

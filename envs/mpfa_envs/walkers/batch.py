@@ -88,7 +88,7 @@ def _choose(
 def _sample_room(
     world: World, walker: Walker, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Places anywhere in the room with a direction each: (x, y), 0 and heading."""
+    """Places anywhere in the world with a direction each: (x, y), 0 and heading."""
     half = np.array(world.size) / 2 - walker.radius
     places = rng.uniform(-half, half, (_SAMPLES, 2))
     headings = rng.uniform(-math.pi, math.pi, _SAMPLES)
@@ -186,7 +186,7 @@ class OrcaRoom:
 
 
 def _outlines(world: World) -> list[list[Point]]:
-    """Outlines of obstacles, counter-clockwise, and of the room around them, clockwise."""
+    """Outlines of obstacles, counter-clockwise, and of the world around them, clockwise."""
     room = world.room
     walls = [
         (room.x_min, room.y_min), (room.x_min, room.y_max),
@@ -232,7 +232,7 @@ class WalkerBatch:
         )
         self.present = False
         """True if there are any walkers."""
-        self._rooms: dict[int, OrcaRoom] = {}
+        self._simulations: dict[int, OrcaRoom] = {}
         """Worlds of the robots around which walkers avoid others, by robot."""
 
     def begin(self, index: int, starts: WalkerStarts) -> None:
@@ -257,15 +257,17 @@ class WalkerBatch:
             counts=count,
         )
         self.present = bool(self._arrays.counts.any())
-        self._rooms.pop(index, None)
+        self._simulations.pop(index, None)
         if any(walker.behavior == "orca" for walker in world.walkers):
-            self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
+            self._simulations[index] = OrcaRoom(
+                world, radius=self._radius, time_step=self._time_step
+            )
         first = self._worlds.standing.counts[index, 1]
         self._worlds.arrays.circles[index, first : first + count, :2] = states[:, :2]
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
         """Move the walkers for one time step."""
-        for index, room in self._rooms.items():
+        for index, room in self._simulations.items():
             if running[index]:
                 count = self._arrays.counts[index]
                 states, targets = self._arrays.states[index], self._arrays.targets[index]

@@ -50,14 +50,14 @@ class WalkerArrays(NamedTuple):
 
 @njit
 def walk(
-    walkers: WalkerArrays, rooms: BatchArrays, running: NDArray[np.bool_], time_step: float
+    walkers: WalkerArrays, worlds: BatchArrays, running: NDArray[np.bool_], time_step: float
 ) -> None:
     """Move the walkers of some robots for one time step."""
-    states, circles = walkers.states, rooms.circles
+    states, circles = walkers.states, worlds.circles
     for robot in range(running.shape[0]):
         if not running[robot]:
             continue
-        behind = rooms.counts[robot, 1]
+        behind = worlds.counts[robot, 1]
         for index in range(walkers.counts[robot]):
             length = walkers.bodies[robot, index, 1] * time_step
             if walkers.behaviors[robot, index] == WAYPOINTS:
@@ -85,9 +85,9 @@ def walk(
             elif walkers.behaviors[robot, index] == WAYPOINTS:
                 _turn(walkers, robot, index, time_step)
             elif walkers.behaviors[robot, index] == ORCA:
-                _glide(walkers, rooms, robot, index, time_step)
+                _glide(walkers, worlds, robot, index, time_step)
             else:
-                _bounce(walkers, rooms, robot, index, time_step)
+                _bounce(walkers, worlds, robot, index, time_step)
             circles[robot, behind + index, 0] = states[robot, index, 0]
             circles[robot, behind + index, 1] = states[robot, index, 1]
 
@@ -114,14 +114,14 @@ def _turn(walkers: WalkerArrays, robot: int, index: int, time_step: float) -> No
 
 @njit
 def _glide(
-    walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, time_step: float
+    walkers: WalkerArrays, worlds: BatchArrays, robot: int, index: int, time_step: float
 ) -> None:
     """Move at the chosen velocity, or stand still if that leads into an obstacle."""
     state, points = walkers.states[robot, index], walkers.waypoints[robot, index]
     x, y = state[0] + time_step * state[2], state[1] + time_step * state[3]
-    room = clearance_at(rooms, robot, x, y)
+    room = clearance_at(worlds, robot, x, y)
     # A walker that is too near already may leave.
-    enough = min(walkers.bodies[robot, index, 0], clearance_at(rooms, robot, state[0], state[1]))
+    enough = min(walkers.bodies[robot, index, 0], clearance_at(worlds, robot, state[0], state[1]))
     if room < enough:
         state[2], state[3] = 0.0, 0.0
         return
@@ -134,7 +134,7 @@ def _glide(
 
 @njit
 def _bounce(
-    walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, time_step: float
+    walkers: WalkerArrays, worlds: BatchArrays, robot: int, index: int, time_step: float
 ) -> None:
     """Go straight ahead, bounce off obstacles and, where that leads nowhere, go back."""
     state, radius = walkers.states[robot, index], walkers.bodies[robot, index, 0]
@@ -145,7 +145,7 @@ def _bounce(
         speed_x, speed_y = state[2], state[3]
         for attempt in range(2):
             x, y = state[0] + duration * state[2], state[1] + duration * state[3]
-            across, up = _normal(walkers, rooms, robot, index, x, y)
+            across, up = _normal(walkers, worlds, robot, index, x, y)
             if across == 0.0 and up == 0.0:
                 state[0], state[1] = x, y
                 break
@@ -155,20 +155,20 @@ def _bounce(
                 state[3] -= into * up
             else:
                 state[2], state[3] = -speed_x, -speed_y
-    walkers.slacks[robot, index] = clearance_at(rooms, robot, state[0], state[1]) - radius
+    walkers.slacks[robot, index] = clearance_at(worlds, robot, state[0], state[1]) - radius
 
 
 @njit
 def _normal(
-    walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, x: float, y: float
+    walkers: WalkerArrays, worlds: BatchArrays, robot: int, index: int, x: float, y: float
 ) -> tuple[float, float]:
     """Direction away from what a walker would run into at a place; zero if there is nothing."""
     state, radius = walkers.states[robot, index], walkers.bodies[robot, index, 0]
-    if clearance_at(rooms, robot, x, y) < radius:
-        across = clearance_at(rooms, robot, x + _NUDGE, y) - clearance_at(
-            rooms, robot, x - _NUDGE, y
+    if clearance_at(worlds, robot, x, y) < radius:
+        across = clearance_at(worlds, robot, x + _NUDGE, y) - clearance_at(
+            worlds, robot, x - _NUDGE, y
         )
-        up = clearance_at(rooms, robot, x, y + _NUDGE) - clearance_at(rooms, robot, x, y - _NUDGE)
+        up = clearance_at(worlds, robot, x, y + _NUDGE) - clearance_at(worlds, robot, x, y - _NUDGE)
         length = math.hypot(across, up)
         if state[2] * across + state[3] * up < 0.0:
             return across / length, up / length

@@ -39,7 +39,7 @@ class BatchArrays(NamedTuple):
     """Shapes by robot; only the first ``counts`` of each row are read."""
 
     half_sizes: NDArray[np.float64]
-    """Half the width and the depth of the rooms [m], ``[N, 2]``."""
+    """Half the width and the depth of the worlds [m], ``[N, 2]``."""
     boxes: NDArray[np.float64]
     """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
     circles: NDArray[np.float64]

@@ -19,7 +19,7 @@ class WorldBatch:
     def __init__(self, worlds: Sequence[World]) -> None:
         robots = len(worlds)
         self._worlds = list(worlds)
-        self._rooms = BatchArrays(
+        self._arrays = BatchArrays(
             np.empty((robots, 2)),
             np.empty((robots, 0, 4)),
             np.empty((robots, 0, 3)),
@@ -31,19 +31,19 @@ class WorldBatch:
         )
         self._grids: list[OccupancyGrid] = []
         # The same without the walkers.
-        self._standing = self._rooms.counts.copy()
+        self._standing = self._arrays.counts.copy()
         for robot, world in enumerate(worlds):
             self[robot] = world
 
     @property
     def arrays(self) -> BatchArrays:
         """Arrays for compiled loops; setting a larger world may replace them."""
-        return self._rooms
+        return self._arrays
 
     @property
     def standing(self) -> BatchArrays:
         """The same arrays with counts that leave out walkers."""
-        return self._rooms._replace(counts=self._standing)
+        return self._arrays._replace(counts=self._standing)
 
     def __len__(self) -> int:
         return len(self._worlds)
@@ -62,11 +62,11 @@ class WorldBatch:
         shapes = rows._asdict()
         half_size = shapes.pop("half_size")
         counts = [len(shape) for shape in shapes.values()]
-        self._rooms = with_row(self._rooms, robot, half_sizes=half_size, counts=counts, **shapes)
-        self._standing[robot] = self._rooms.counts[robot]
+        self._arrays = with_row(self._arrays, robot, half_sizes=half_size, counts=counts, **shapes)
+        self._standing[robot] = self._arrays.counts[robot]
         self._standing[robot, 1] -= len(walkers)
         self._worlds[robot] = world
-        self._rooms.grid_of[robot] = -1
+        self._arrays.grid_of[robot] = -1
         if world.occupancy is not None:
             self._set_grid(robot, world.occupancy)
 
@@ -74,15 +74,15 @@ class WorldBatch:
         """Put a robot into a map, which it shares with other robots there."""
         grids = self._grids
         if grid not in grids:
-            used = {int(number) for number in self._rooms.grid_of if number >= 0}
+            used = {int(number) for number in self._arrays.grid_of if number >= 0}
             kept = [number for number in range(len(grids)) if number in used]
             places = np.full(len(grids) + 1, -1)
             places[kept] = np.arange(len(kept))
             self._grids = grids = [*(grids[number] for number in kept), grid]
             # The last place stands for none: -1 stays -1.
-            self._rooms.grid_of[:] = places[self._rooms.grid_of]
-            self._rooms = self._rooms._replace(grids=_grid_arrays(grids))
-        self._rooms.grid_of[robot] = grids.index(grid)
+            self._arrays.grid_of[:] = places[self._arrays.grid_of]
+            self._arrays = self._arrays._replace(grids=_grid_arrays(grids))
+        self._arrays.grid_of[robot] = grids.index(grid)
 
 
 def _grid_arrays(grids: Sequence[OccupancyGrid]) -> GridArrays:

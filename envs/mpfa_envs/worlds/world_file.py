@@ -82,14 +82,14 @@ class _Reader(NodeReader):
         if "size" not in entries:
             raise self.error(root, "size is missing; it is a list [width, depth] in meters")
         with self.at(entries["size"]):
-            room = World(name=name, size=self.pair(entries["size"], "size", "[width, depth]"))
+            empty = World(name=name, size=self.pair(entries["size"], "size", "[width, depth]"))
         obstacles: dict[str, Any] = {
-            key: self.parts(entries, key, room, key) for key in ("boxes", "cylinders", "polygons")
+            key: self.parts(entries, key, empty, key) for key in ("boxes", "cylinders", "polygons")
         }
         with self.at(root):
-            world = replace(room, **obstacles)
-        starts = self.parts(entries, "start", room, "start_regions")
-        goals = self.parts(entries, "goal", room, "goal_regions")
+            world = replace(empty, **obstacles)
+        starts = self.parts(entries, "start", empty, "start_regions")
+        goals = self.parts(entries, "goal", empty, "goal_regions")
         for key, regions in (("start", starts), ("goal", goals)):
             for node, region in zip(self.nodes(entries, key), regions, strict=True):
                 found = has_room(world, region, _REGION_CLEARANCE)
