@@ -88,10 +88,9 @@ def favor(model: PriorityTD3) -> float:
     return float(counts[order[-third:]].mean() / counts[order[:third]].mean())
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_larger_td_errors_are_sampled_more_often(algorithm: str) -> None:
-    assert favor(model_of(algorithm, "per")) > 1.4
-    assert favor(model_of(algorithm, "uniform")) == pytest.approx(1.0, abs=0.1)
+def test_larger_td_errors_are_sampled_more_often() -> None:
+    assert favor(model_of("td3", "per")) > 1.4
+    assert favor(model_of("td3", "uniform")) == pytest.approx(1.0, abs=0.1)
 
 
 def test_several_environments_with_normalized_observations_write_their_transitions() -> None:

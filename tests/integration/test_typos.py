@@ -17,13 +17,9 @@ HEAVY = ("torchrl", "wandb", "matplotlib", "pandas")
     ("script", "word", "hint"),
     [
         ("train.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
-        ("train.py", "environment.noise.dropot=1", "did you mean 'environment.noise.dropout'?"),
         ("train.py", "curriculum.stages=[{world:A,action:500}]", "did you mean 'actions'?"),
-        ("train.py", "curriculum.stages=[{wrld:A,actions:5}]", "did you mean 'world'?"),
         ("train.py", "seed=abc", "seed: Value 'abc'"),
-        ("train.py", "environment.robot=burgr", "did you mean 'burger'?"),
         ("compare.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
-        ("tune.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
         ("evaluate.py", "td3-room", "there is no policy at td3-room"),
         ("report.py", "runs/nowhere", "there is no runs/nowhere"),
     ],
