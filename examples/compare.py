@@ -76,7 +76,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
     # Imported here, and below, as they take seconds: what is misspelt is answered before.
-    from training.comparison.jobs import check_free, parse_arms
+    from training.comparison.arms import check_free, parse_arms
 
     try:
         options.overrides, options.plugin = with_plugin(options.overrides, options.plugin)

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.paper.published import NAMES, PHIS
-from training.comparison.jobs import Arm, Comparison, Job
+from training.comparison.arms import Arm
+from training.comparison.jobs import Comparison, Job
 
 SETTINGS = ("regime=paper", "robots=16", "updates=16", "learner.compile=true", "tracking=off")
 """The paper's task and replay volume, with sixteen robots in the place of one."""

@@ -75,7 +75,6 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "iteration_4x256": replay.measure_iteration_4x256,
     "replay_1e5": replay_peers.measure,
     "replay_1e6": partial(replay_peers.measure, "replay_1e6", capacity=1_000_000),
-    "update_growth": replay.measure_growth,
     "extend_one": replay.measure_extend_one,
     "extend_16": replay.measure_extend_16,
     "train_step": training.measure_train_step,

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.speed.timing import seconds_per_call
 from mpfa_envs import Lidar, Task, World
 from mpfa_envs.paths.distance import FreeGrid, shortest_length
 from mpfa_envs.paths.tasks import sample_task_on_grid
@@ -66,10 +67,7 @@ def boxes_of(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
 def spent(function: Callable[[], object], times: int) -> float:
     """CPU time of a call [s], after one that compiles."""
     function()
-    start = time.process_time()
-    for _ in range(times):
-        function()
-    return (time.process_time() - start) / times
+    return seconds_per_call(function, times)
 
 
 def main() -> None:

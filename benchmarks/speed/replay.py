@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import cast
 
 import torch
@@ -11,15 +10,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from benchmarks.speed.timing import (
-    MICROSECONDS,
     Call,
     Entry,
-    Timing,
     compare,
-    entry,
-    few_threads,
-    report_progress,
-    seconds_per_call,
 )
 from torchrl_mpfa import (
     ACTION_GRADIENT,
@@ -37,9 +30,6 @@ OBSERVATION_SIZE = 24
 ACTION_SIZE = 2
 ALPHA = 0.6
 BETA = 0.4
-GROWTH_CAPACITIES = (10_000, 100_000, 1_000_000)
-SHORTEST_ROUND = 400
-"""Steps of a round of the growth; small buffers count their entropies several times in it."""
 _FILL_ROWS = 100_000
 
 
@@ -190,64 +180,3 @@ def measure_extend_16(
 ) -> list[Entry]:
     """Write sixteen transitions in one call, as from sixteen environments."""
     return measure_extend_one(name, rows=16, capacity=capacity, quick=quick)
-
-
-def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool) -> list[Entry]:
-    """Time the replay work of one training step by capacity, counting of entropies included.
-
-    A step writes one transition, samples and updates. The entropies of Eqs. (16)-(17) are counted
-    over the whole buffer whenever a fixed share of it was rewritten: each round is as long as it
-    takes for that to happen once, so that the mean of a round holds its full cost. The ratio of
-    ``update_growth`` is the growth of the time over that of log N, the depth of a segment tree.
-    """
-    steps, periods = {}, {}
-    for capacity in capacities:
-        buffer = make_mpfa_buffer(capacity)
-        update, transition = make_mpfa_update(buffer), make_transitions(1)
-        periods[capacity] = int(buffer.sampler.entropy_refresh * capacity) + 1
-
-        def step(
-            buffer: SignalReplayBuffer = buffer,
-            update: Call = update,
-            transition: TensorDict = transition,
-        ) -> None:
-            buffer.extend(transition)
-            update()
-
-        steps[capacity] = step
-    times: dict[int, list[float]] = {capacity: [] for capacity in capacities}
-    with few_threads(1):
-        for step in steps.values():
-            seconds_per_call(step, 20)
-        for _ in range(1 if quick else 3):
-            for capacity, step in steps.items():
-                count = periods[capacity] * max(1, SHORTEST_ROUND // periods[capacity])
-                times[capacity].append(seconds_per_call(step, count))
-    timings = {capacity: Timing(tuple(found)) for capacity, found in times.items()}
-    entries = []
-    for capacity, timing in timings.items():
-        name = f"step_at_{_power_of_ten(capacity)}"
-        entries.append(entry(name, timing.median * MICROSECONDS, "us"))
-        report_progress(
-            f"{name}: {timing.median * MICROSECONDS:.1f} us "
-            f"(fastest round {timing.minimum * MICROSECONDS:.1f}), "
-            f"entropies counted every {periods[capacity]} steps"
-        )
-    small, large = min(capacities), max(capacities)
-    growth = timings[large].ratio(timings[small])
-    log_growth = float(torch.tensor(large).log2() / torch.tensor(small).log2())
-    return [
-        *entries,
-        entry(
-            "update_growth",
-            growth,
-            "x",
-            ratio=growth / log_growth,
-            baseline=f"log {_power_of_ten(large)} / log {_power_of_ten(small)} = {log_growth:.2f}",
-        ),
-    ]
-
-
-def _power_of_ten(capacity: int) -> str:
-    mantissa, exponent = f"{capacity:e}".split("e")
-    return f"{float(mantissa):g}e{int(exponent)}"

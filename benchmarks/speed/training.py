@@ -47,8 +47,6 @@ WIDTH = 256
 CAPACITY = 100_000
 THREADS = 2
 TRANSITION = ("observation", "action", "next")
-ELSEWHERE_SECONDS = 2e-3
-"""Time of an update that is computed elsewhere [s]."""
 _FILL = 10_000
 _BLOCK = 20
 _PLAIN = {"layer_norm": False, "final_init": None}

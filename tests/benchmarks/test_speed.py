@@ -61,17 +61,6 @@ def test_replay_on_disk_says_its_times_and_its_memory_and_leaves_no_file(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_growth_is_the_time_of_the_largest_buffer_over_that_of_the_smallest(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(replay, "SHORTEST_ROUND", 20)
-    *sizes, growth = replay.measure_growth(capacities=(512, 4096), quick=True)
-    check_schema([*sizes, growth])
-    assert [found["name"] for found in sizes] == ["step_at_5.12e2", "step_at_4.096e3"]
-    assert growth["value"] == pytest.approx(sizes[1]["value"] / sizes[0]["value"])
-    assert growth["ratio"] == pytest.approx(growth["value"] / (12 / 9))
-
-
 def test_the_run_prints_a_table_and_writes_what_it_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

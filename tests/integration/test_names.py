@@ -14,7 +14,8 @@ import export
 import report
 import tune
 from mpfa_envs import RobotNoise
-from training.comparison.jobs import Arm, Job
+from training.comparison.arms import Arm
+from training.comparison.jobs import Job
 from training.evaluating import Conditions
 from training.files import check_folder, full_disk, run_script, short_name
 from training.settings.train import _one_folder

@@ -14,7 +14,7 @@ from optuna.distributions import (
 )
 
 from torchrl_mpfa.checks import unknown
-from training.comparison.jobs import check_free, with_defaults
+from training.comparison.arms import check_free, with_defaults
 from training.settings.command_line import as_text, composed, parse_overrides, read_names
 from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings

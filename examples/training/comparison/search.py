@@ -25,8 +25,9 @@ from tqdm import tqdm
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
+from training.comparison.arms import Arm
 from training.comparison.execution import LOG, Commands, Work, workers_of
-from training.comparison.jobs import Arm, Job
+from training.comparison.jobs import Job
 from training.comparison.ranges import Ranges, as_lines, fixed_settings
 from training.comparison.workers import Worker
 from training.figures import plot_search

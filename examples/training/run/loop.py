@@ -183,7 +183,7 @@ class TrainingRun:
         self._before = self.actions
         """Actions before the last iteration."""
         run_id = None if state is None else state["wandb"]
-        self.tracker = tracking.Tracker(settings, folder, run_id=run_id, actions=self.actions)
+        self.tracker = tracking.Tracker(settings, folder, run_id=run_id)
         self.hooks = [self.tracker, Checkpoints(), tracking.Pictures(), Progress(), *hooks]
 
     def _build(self) -> None:

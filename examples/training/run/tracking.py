@@ -46,18 +46,14 @@ class Tracker(Hook):
 
     Args:
         settings: The settings, logged as the run's configuration.
-        folder: Of the run, where logs are kept.
+        folder: Of the run, where wandb's log is kept.
         run_id: wandb's id of a run that resumes; it stays one run.
-        actions: Actions after which the run resumes; 0: it begins.
     """
 
-    def __init__(
-        self, settings: TrainSettings, folder: Path, *, run_id: str | None, actions: int = 0
-    ) -> None:
+    def __init__(self, settings: TrainSettings, folder: Path, *, run_id: str | None) -> None:
         # A sweep has given its run an id.
         self.run_id = run_id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
         self._wanted = with_environment(settings.tracking)
-        self._settings, self._folder, self._actions = settings, folder, actions
         self.upload = upload_command(self._wanted, folder, self.run_id)
         """Command that uploads the run to wandb, if it is kept offline."""
         has_pictures = self._wanted.mode != "off" or self._wanted.tensorboard
@@ -73,11 +69,10 @@ class Tracker(Hook):
     def on_begin(self, run: TrainingRun) -> None:
         """Open the files; those of an earlier run in the folder have been moved by now."""
         if self._wanted.csv:
-            self._logs.append(CSVLog(self._folder, actions=self._actions))
+            self._logs.append(CSVLog(run.folder, actions=run.actions))
         if self._wanted.tensorboard:
-            settings = dict(settings_by_name(self._settings))
-            log = TensorboardLog(self._folder, actions=self._actions, settings=settings)
-            self._logs.append(log)
+            settings = dict(settings_by_name(run.settings))
+            self._logs.append(TensorboardLog(run.folder, actions=run.actions, settings=settings))
 
     def on_episode(self, run: TrainingRun, record: EpisodeRecord) -> None:
         """Log one episode."""

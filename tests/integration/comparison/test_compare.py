@@ -20,7 +20,8 @@ from mpfa_envs import Policy, load_policy, save_policy
 from tests.integration.tiny_runs import OVERRIDES
 from training import figures, files
 from training.comparison import execution
-from training.comparison.jobs import Evaluation, Job, other_than_asked, parse_arm, with_defaults
+from training.comparison.arms import parse_arm, with_defaults
+from training.comparison.jobs import Evaluation, Job, other_than_asked
 from training.comparison.workers import Lost
 from training.records import read_table
 from training.run import script

@@ -26,7 +26,8 @@ from tests.integration.comparison.test_compare import InThisProcess, alive, desc
 from tests.integration.tiny_runs import OVERRIDES
 from training import files
 from training.comparison import execution
-from training.comparison.jobs import Job, parse_arm
+from training.comparison.arms import parse_arm
+from training.comparison.jobs import Job
 from training.records import read_table, write_table
 from training.settings.command_line import composed
 
