@@ -155,6 +155,12 @@ def check_seed(value: Any) -> int:
     return check_count("seed", value, least=0, most=math.inf)
 
 
+def got(value: object, known: Iterable[str]) -> str:
+    """What was given in place of a known name, and the nearest of them."""
+    question = did_you_mean(value, known)
+    return f"got {value!r} ({question})" if question else f"got {value!r}"
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """A question about the nearest known name; empty if none is near."""
     near = get_close_matches(str(name), list(known), n=1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_share, did_you_mean, plain
+from mpfa_envs.checks import check_count, check_share, got, plain
 from mpfa_envs.generators.generate import (
     GENERATORS,
     generate_world,
@@ -320,10 +320,9 @@ def _generator_of(world: object) -> str | None:
         return world
     if world.isidentifier() and world not in WORLDS:
         known = [*GENERATORS, *WORLDS]
-        hint = f" ({question})" if (question := did_you_mean(world, known)) else ""
         raise ValueError(
             "world must be a World, the path of a .yaml file, a sequence of these, or one of "
-            f"{known}, got {world!r}{hint}"
+            f"{known}, {got(world, known)}"
         )
     return None
 

@@ -253,7 +253,7 @@ def run_tasks(
         fleets = []
         for numbers in _by_time_limit(tasks).values():
             robots = min(envs_at_once, len(numbers))
-            arguments["world"] = _room_for([tasks[number].world for number in numbers])
+            arguments["world"] = _largest_of([tasks[number].world for number in numbers])
             limit = tasks[numbers[0]].limit(arguments)
             env = VectorNavigationEnv(robots, **{**arguments, **limit})
             fleets.append((opened.enter_context(closing(env)), numbers))
@@ -305,7 +305,7 @@ def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
     return found
 
 
-def _room_for(worlds: Sequence[World]) -> World:
+def _largest_of(worlds: Sequence[World]) -> World:
     """An empty world of the largest width and depth, which bounds the observations."""
     sides = zip(*(world.size for world in worlds), strict=True)
     width, depth = (max(each) for each in sides)

@@ -17,7 +17,7 @@ from typing import Final, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.checks import check_count, check_share, got
 from mpfa_envs.generators.mazes import fields, mazes
 from mpfa_envs.generators.rooms import bars, clutter, crowd, halls, rooms
 from mpfa_envs.paths.distance import FreeGrid
@@ -149,10 +149,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         True
     """
     if name not in GENERATORS:
-        hint = did_you_mean(name, GENERATORS)
-        raise ValueError(
-            f"generator must be one of {list(GENERATORS)}, got {name!r}{hint and f' ({hint})'}"
-        )
+        raise ValueError(f"generator must be one of {list(GENERATORS)}, {got(name, GENERATORS)}")
     check_count("seed", seed, least=0, most=len(get_args(Split)) * _SPLIT_SIZE - 1)
     if difficulty is not None:
         difficulty = check_share("difficulty", difficulty)
@@ -286,8 +283,7 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
             return load_world(world)
         if name.endswith(_GAZEBO):
             return load_gazebo_world(world)
-    hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
         f"world must be a World, the path of {KINDS}, 'barn-0' to 'barn-19', a generator's "
-        f"'NAME-SEED' or one of {list(WORLDS)}, got {world!r}{hint}"
+        f"'NAME-SEED' or one of {list(WORLDS)}, {got(world, WORLDS)}"
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from mpfa_envs.checks import check_choice, did_you_mean
+from mpfa_envs.checks import check_choice, got
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import (
@@ -77,8 +77,7 @@ def make_planner(
         [True, True]
     """
     if name not in PLANNERS:
-        hint = f" ({question})" if (question := did_you_mean(name, PLANNERS)) else ""
-        raise ValueError(f"name must be one of {sorted(PLANNERS)}, got {name!r}{hint}")
+        raise ValueError(f"name must be one of {sorted(PLANNERS)}, {got(name, PLANNERS)}")
     if name == "dwa":
         return DynamicWindow(robot=robot, memory=memory)
     if name == "mpc":

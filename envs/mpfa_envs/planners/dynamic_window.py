@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.robots.motion_loops import pairs_within
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.observation import DISTANCE_SCALE, Memory, observation_slices
@@ -314,7 +315,4 @@ def _pairs(
     speeds = np.linspace(slow, fast, check_count("samples", samples, least=2))
     if robot.can_stop:
         speeds = np.union1d(speeds.round(9), 0.0)
-    pairs = np.stack(np.meshgrid(speeds, speeds), axis=-1).reshape(-1, 2)
-    across = 0.5 * np.abs(pairs[:, 1] - pairs[:, 0])
-    can = across <= robot.wheel_limits.across + 1e-9
-    return np.asarray(pairs[can & (reverses | (pairs.sum(axis=1) >= 0.0))])
+    return pairs_within(robot.wheel_limits._replace(reverse=reverses), speeds)

@@ -11,6 +11,7 @@ import numpy as np
 from mpfa_envs.checks import check_seed
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
 from mpfa_envs.planners.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
+from mpfa_envs.robots.motion_loops import pairs_within
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import least_room, see
 from mpfa_envs.sensing.map_loops import BLOCKED, cell_of
@@ -252,7 +253,5 @@ def _speeds_to_try(body: Body) -> NDArray[np.float64]:
     """Speeds of both wheels that are tried [m/s], the slowest first, ``[K, 2]``."""
     limits = body.limits
     speeds = np.linspace(limits.slow, limits.fast, _SPEEDS)
-    pairs = np.stack(np.meshgrid(speeds, speeds), axis=-1).reshape(-1, 2)
-    can = 0.5 * np.abs(pairs[:, 1] - pairs[:, 0]) <= limits.across + 1e-9
-    can &= limits.reverse | (pairs.sum(axis=1) >= 0.0)
-    return np.concatenate((np.full((1, 2), max(limits.slow, 0.0)), pairs[can]))
+    slowest = np.full((1, 2), max(limits.slow, 0.0))
+    return np.concatenate((slowest, pairs_within(limits, speeds)))

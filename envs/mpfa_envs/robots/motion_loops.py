@@ -30,6 +30,13 @@ class WheelLimits(NamedTuple):
     """False if the mean of both is never below 0."""
 
 
+def pairs_within(limits: WheelLimits, speeds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pairs of some speeds that the left and the right wheel can have [m/s], ``[K, 2]``."""
+    pairs: NDArray[np.float64] = np.stack(np.meshgrid(speeds, speeds), axis=-1).reshape(-1, 2)
+    can = 0.5 * np.abs(pairs[:, 1] - pairs[:, 0]) <= limits.across + 1e-9
+    return pairs[can & (limits.reverse | (pairs.sum(axis=1) >= 0.0))]
+
+
 _ROUNDING = 1e-12
 """Speeds beyond a limit by this are on it [m/s]: what was limited once keeps its bits."""
 

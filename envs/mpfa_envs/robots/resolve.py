@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from mpfa_envs.checks import did_you_mean
+from mpfa_envs.checks import got
 from mpfa_envs.robots.model import ROBOTS, RobotModel
 
 RobotChoice = str | os.PathLike[str] | Mapping[str, Any] | RobotModel
@@ -34,8 +34,7 @@ def resolve_robot(robot: RobotChoice) -> RobotModel:
         from mpfa_envs.robots.robot_file import load_robot
 
         return load_robot(robot)
-    hint = f" ({question})" if (question := did_you_mean(robot, ROBOTS)) else ""
     raise ValueError(
         "robot must be a RobotModel, its fields, the path of a .yaml file or one of "
-        f"{sorted(ROBOTS)}, got {robot!r}{hint}"
+        f"{sorted(ROBOTS)}, {got(robot, ROBOTS)}"
     )
