@@ -100,3 +100,8 @@ def test_noise_needs_a_generator_and_is_its_only_randomness() -> None:
         lidar.scan(0.0, 0.0, 0.0)
     first, second = (lidar.scan(0, 0, 0, rng=np.random.default_rng(1)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_mounted_lidar_at_whole_numbers_scans_as_at_the_same_fractions() -> None:
+    lidar = Lidar(WORLDS["A"], mount=(0.1, 0.0))
+    assert lidar.scan(0, 0, 0).tolist() == lidar.scan(0.0, 0.0, 0.0).tolist()
