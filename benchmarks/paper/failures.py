@@ -72,8 +72,8 @@ KINDS: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
 
 def question_table(
     new: Mapping[str, pd.DataFrame], found: Mapping[str, pd.DataFrame]
-) -> tuple[str, Interval, float]:
-    """Return the table of the question, and its primary ratio with p, once all runs are made."""
+) -> tuple[str, list[tuple[Interval, float]]]:
+    """Return the table of the question, and each planned ratio with its p, once all are made."""
     every = {
         f"ddpg-{name}": pd.concat([found[f"ddpg-{name}"], new[f"ddpg-{name}"]]) for name in CLAIMS
     }
@@ -86,7 +86,7 @@ def question_table(
     asked = [(pair, "failures") for pair in PAIRS]
     asked += [(PAIRS[0], kind) for kind in ("collisions", "out of time")]
     ps = [permutation_p(*shares(new, *what)) for what in asked]
-    corrected = [ps[0], *holm(np.array(ps[1 : len(PAIRS)]))]
+    corrected = [ps[0], *map(float, holm(np.array(ps[1 : len(PAIRS)])))]
     lines = []
     for number, (pair, kind) in enumerate(asked):
         ours, whole = shares(new, pair, kind), shares(every, pair, kind)
@@ -107,4 +107,5 @@ def question_table(
         )
     head = ["", "paper", "shares of tests", "ratio, 95 %", "p", "p corrected"]
     text = table([*head, "all 46 seeds, exploratory"], lines)
-    return text, ratio_interval(*shares(new, *asked[0]), paired=False), ps[0]
+    ratios = [ratio_interval(*shares(new, pair, "failures"), paired=False) for pair in PAIRS]
+    return text, list(zip(ratios, corrected, strict=True))

@@ -183,6 +183,10 @@ def test_question_with_all_runs_compares_failures_of_new_seeds(tmp_path: Path) -
     said, table = question_text(rows, measures(made_up(tmp_path / "ten", ten)))
     assert "In 36 new seeds MPFA-PER fails 0.50 times as often as PER, and the planned" in said
     assert "test does find a difference, p = 0.000." in said
+    assert (
+        "the paper's, 0.66, lies outside of them. Beside uniform replay MPFA-PER fails 0.5" in said
+    )
+    assert said.endswith("and PER fails 1.00 times as often (corrected p = 1.000).")
     primary, second, third, collisions, late = table.splitlines()[2:]
     start = "| MPFA-PER / PER, failures, primary | 0.66 | 4.00% and 8.00% | 0.50 [0.4"
     assert primary.startswith(start)
