@@ -123,7 +123,9 @@ class Lidar:
                 counts=np.add(worlds.counts, (0, len(moving), 0, 0)),
             )
         ranges = np.empty((1, self.angles.size))
-        self.cast_all(np.array([[x, y, heading]], float), np.ones(1, dtype=np.bool_), worlds, ranges)
+        self.cast_all(
+            np.array([[x, y, heading]], float), np.ones(1, dtype=np.bool_), worlds, ranges
+        )
         return ranges[0]
 
     def cast_all(
