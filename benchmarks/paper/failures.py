@@ -16,7 +16,7 @@ from benchmarks.paper.rows import Rows
 from benchmarks.paper.runs import CLAIMS, question
 from mpfa_envs.evaluation.results import Interval
 from training.comparison.report import table
-from training.statistics import Array, holm, permutation_p
+from training.statistics import Array, chance, holm, permutation_p
 
 PUBLISHED = {name: 1.0 - row.success for name, row in {**TABLE_2, **TABLE_4}.items()}
 """Shares of failures in the paper."""
@@ -68,12 +68,14 @@ KINDS: dict[str, Callable[[pd.DataFrame], pd.Series]] = {
     "out of time": lambda runs: (1.0 - runs["success"] - runs["collision"]).abs().round(9),
 }
 """Shares of each run's tests that count, by name."""
+SPLIT = ("collisions", "out of time")
+"""The kinds of failures, which add up to all of them."""
 
 
 def question_table(
     new: Mapping[str, pd.DataFrame], found: Mapping[str, pd.DataFrame]
 ) -> tuple[str, list[tuple[Interval, float]]]:
-    """Return the table of the question, and each planned ratio with its p, once all are made."""
+    """Return the table of the question, and the ratio and p of each row, once all runs are made."""
     every = {
         f"ddpg-{name}": pd.concat([found[f"ddpg-{name}"], new[f"ddpg-{name}"]]) for name in CLAIMS
     }
@@ -84,9 +86,10 @@ def question_table(
         return [KINDS[kind](measured[f"ddpg-{name}"]).to_numpy(dtype=float) for name in pair]
 
     asked = [(pair, "failures") for pair in PAIRS]
-    asked += [(PAIRS[0], kind) for kind in ("collisions", "out of time")]
+    asked += [(pair, kind) for pair in PAIRS for kind in SPLIT]
     ps = [permutation_p(*shares(new, *what)) for what in asked]
-    corrected = [ps[0], *map(float, holm(np.array(ps[1 : len(PAIRS)])))]
+    corrected = {1 + number: p for number, p in enumerate(holm(np.array(ps[1 : len(PAIRS)])))}
+    ratios = [ratio_interval(*shares(new, *what), paired=False) for what in asked]
     lines = []
     for number, (pair, kind) in enumerate(asked):
         ours, whole = shares(new, pair, kind), shares(every, pair, kind)
@@ -98,14 +101,24 @@ def question_table(
                 f"{NAMES[pair[0]]} / {NAMES[pair[1]]}, {kind}, {order}",
                 f"{PUBLISHED[pair[0]] / PUBLISHED[pair[1]]:.2f}" if known else "",
                 " and ".join(f"{runs.mean():.2%}" for runs in ours),
-                ratio_text(ratio_interval(*ours, paired=False)),
+                ratio_text(ratios[number]),
                 f"{ps[number]:.3f}",
-                f"{corrected[number]:.3f}" if planned else "",
+                f"{corrected[number]:.3f}" if number in corrected else "",
                 f"{ratio_text(ratio_interval(*whole, paired=False))}, "
                 f"p = {permutation_p(*whole):.3f}",
             ]
         )
     head = ["", "paper", "shares of tests", "ratio, 95 %", "p", "p corrected"]
     text = table([*head, "all 46 seeds, exploratory"], lines)
-    ratios = [ratio_interval(*shares(new, pair, "failures"), paired=False) for pair in PAIRS]
-    return text, list(zip(ratios, corrected, strict=True))
+    final = [float(corrected.get(number, p)) for number, p in enumerate(ps)]
+    return text, list(zip(ratios, final, strict=True))
+
+
+def question_power(new: Mapping[str, pd.DataFrame], ratio: float) -> float:
+    """Return the chance to find a true ratio MPFA-PER / PER, given PER's failures in these runs.
+
+    As in the design, MPFA-PER deviates in proportion to its mean.
+    """
+    per = KINDS["failures"](new["ddpg-per"])
+    deviation = float(per.std(ddof=1)) * math.hypot(1.0, ratio)
+    return chance(float(per.mean()) * (1.0 - ratio), deviation, len(per))

@@ -314,15 +314,10 @@ def test_failures_of_mpfa_per_and_per_are_those_of_the_rows() -> None:
         ratio = bootstrapped(*failed, paired=True, odds=odds)
         assert numbers(ours[claim])[0] == pytest.approx(ratio[0], abs=0.00501)
         assert numbers(ours[claim])[1:] == pytest.approx(ratio[1:], abs=0.03)
-    _, low, high = numbers(ours["ratio of failures MPFA-PER / PER, 95 %"])
-    published = (100 - PUBLISHED["MPFA-PER"]) / (100 - PUBLISHED["PER"])
-    where = "inside" if low <= published <= high else "outside of"
-    assert f"and its ratio of failures {where} it." in whole_page()
     hits = [[count / 200 for count in collisions(f"ddpg-{name}")] for name in ("mpfa_per", "per")]
     ratio = bootstrapped(*hits, paired=True)
     assert numbers(ours["the same of collisions alone"])[0] == pytest.approx(ratio[0], abs=0.00501)
     assert numbers(ours["the same of collisions alone"])[1:] == pytest.approx(ratio[1:], rel=0.05)
-    assert f"MPFA-PER collides {ratio[0]:.2f} times as often as PER" in whole_page()
     gaps = [x - y for x, y in zip(times("ddpg-mpfa_per"), times("ddpg-per"), strict=True)]
     claim = "time of a successful test, MPFA-PER − PER [s], 95 %"
     assert numbers(ours[claim]) == pytest.approx(student(gaps), abs=0.0501)
@@ -422,10 +417,15 @@ def by_sampled_deals(ours: list[float], theirs: list[float]) -> float:
 
 
 def test_answer_of_the_question_is_that_of_the_rows_of_36_new_seeds() -> None:
-    missed: dict[str, dict[str, dict[int, int]]] = {"failures": {}, "collisions": {}}
+    missed: dict[str, dict[str, dict[int, int]]] = {
+        "failures": {},
+        "collisions": {},
+        "out of time": {},
+    }
     for row in read(ROWS / "question/tests.csv.gz"):
         name, seed = row["arm"].removeprefix("ddpg-"), int(row["seed"])
-        here = {"failures": row["success"] != "1", "collisions": row["collision"] == "1"}
+        missed_it, hit = row["success"] != "1", row["collision"] == "1"
+        here = {"failures": missed_it, "collisions": hit, "out of time": missed_it and not hit}
         for kind, counts in here.items():
             runs = missed[kind].setdefault(name, {})
             runs[seed] = runs.get(seed, 0) + counts
@@ -437,6 +437,8 @@ def test_answer_of_the_question_is_that_of_the_rows_of_36_new_seeds() -> None:
         ("MPFA-PER / uniform", "failures, secondary"),
         ("PER / uniform", "failures, secondary"),
         ("MPFA-PER / PER", "collisions, exploratory"),
+        ("MPFA-PER / uniform", "collisions, exploratory"),
+        ("MPFA-PER / uniform", "out of time, exploratory"),
     ):
         cells = table[f"{pair}, {kind}"]
         new, old = missed[kind.split(",")[0]], [METHODS[name] for name in pair.split(" / ")]
@@ -446,13 +448,15 @@ def test_answer_of_the_question_is_that_of_the_rows_of_36_new_seeds() -> None:
         assert numbers(cells[3])[0] == pytest.approx(ratio[0], abs=0.00501)
         assert numbers(cells[3])[1:] == pytest.approx(ratio[1:], rel=0.05)
         ps.append(by_sampled_deals(*sides))
-        assert float(cells[4]) == pytest.approx(ps[-1], abs=0.012)
-        before = [
-            collisions(f"ddpg-{name}")
-            if "coll" in kind
-            else [200 * (1 - share) for share in success(f"ddpg-{name}").values()]
-            for name in old
-        ]
+        assert float(cells[4]) == pytest.approx(ps[-1], abs=0.015)
+        before = []
+        for name in old:
+            lost = [200 * (1 - share) for share in success(f"ddpg-{name}").values()]
+            hits = collisions(f"ddpg-{name}")
+            late = [all_lost - hit for all_lost, hit in zip(lost, hits, strict=True)]
+            before.append(
+                {"failures": lost, "collisions": hits, "out of time": late}[kind.split(",")[0]]
+            )
         whole = [
             np.mean([*side, *(count / 200 for count in ten)])
             for side, ten in zip(sides, before, strict=True)
