@@ -104,7 +104,7 @@ def documented(package, alias):
     ("package", "names"),
     [
         ("torchrl_mpfa", ["saving.save_atomically", "methods.her.HindsightGoals"]),
-        ("mpfa_envs", ["worlds.barn.barn_world", "deploy.map_path", "generators.resolve"]),
+        ("mpfa_envs", ["worlds.barn.barn_world", "deploy.map_path", "generators.generate"]),
     ],
 )
 def test_a_module_is_there_after_a_bare_import(package, names):

@@ -25,7 +25,7 @@ GONE = {
     "SignalDQNLoss": _DQN,
     "DQNLearner": _DQN,
     "MultiTensorSoftUpdate": "TorchRL's SoftUpdate: a learner moves its targets itself",
-    "ReplayHistory": "examples/training/run/history.py, or buffer.distributions() by yourself",
+    "ReplayHistory": "examples/training/run/updates.py, or buffer.distributions() by yourself",
     **dict.fromkeys(
         ("TabularQLearner", "make_value_table"),
         "examples/training/run/q_learning.py, which train.py has for learner=q_learning",
