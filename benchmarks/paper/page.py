@@ -105,10 +105,10 @@ that reached their goal.
 """,
     """
 A run fails in each test that does not succeed. Ratios of failures have an interval by a bootstrap
-over seeds: 95 % percentiles of 10,000 resamples. Of ten seeds it [covers 89 to 95
-%](study.md#units-intervals-tests). Where interval and p disagree, nothing was found. Arms with at
-least six seeds in common are compared seed by seed, and p is that of the permutation test of signs.
-The test is the same for failures and for success. Other arms are compared by the means of all their
+over seeds: 95 % percentiles of 10,000 resamples. How often it covers a ratio was not tried. Where
+interval and p disagree, nothing was found. Arms of the tables with at least six seeds in common are
+compared seed by seed, and p is that of the permutation test of signs. The test is the same for
+failures and for success. Other arms are compared by the means of all their
 runs, without a power. *Found with 80 % power* is the true difference that a t-test of as many seeds
 finds with that probability. Its level is 5 % divided by the number of comparisons.
 """,
@@ -249,7 +249,7 @@ def question_text(asked: Rows, found: Mapping[str, pd.DataFrame]) -> list[str]:
         (other,) = set(parts) - set(found_in)
         said += (
             f" Of MPFA-PER's failures beside uniform replay those by {_BY[found_in[0]]} differ; "
-            f"in those by {_BY[other]} no difference was found (exploratory)."
+            f"in those by {_BY[other]} no difference was found (exploratory, uncorrected)."
         )
     power = (
         "Given the failures of PER in these runs, their test finds the paper's ratio with a chance "

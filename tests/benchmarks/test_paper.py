@@ -185,7 +185,9 @@ def test_question_with_all_runs_compares_failures_of_new_seeds(tmp_path: Path) -
     assert "test does find a difference, p = 0.000." in said
     assert "The paper's 0.66 lies outside of it, but" in said
     assert "and PER fails 1.00 times as often (corrected p = 1.000)." in said
-    assert said.endswith("in those by the time limit no difference was found (exploratory).")
+    assert said.endswith(
+        "in those by the time limit no difference was found (exploratory, uncorrected)."
+    )
     primary, second, third, collisions, late, *_ = table.splitlines()[2:]
     start = "| MPFA-PER / PER, failures, primary | 0.66 | 4.00% and 8.00% | 0.50 [0.4"
     assert primary.startswith(start)
