@@ -115,7 +115,7 @@ finds with that probability. Its level is 5 % divided by the number of compariso
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
 changed before any row was looked at. The intervals are Student's in place of a bootstrap's, so that
-other programs compute the same numbers. The arm to the letter has five seeds in place of ten.
+other programs compute the same numbers. Arms closer to the paper have five seeds in place of ten.
 """,
 )
 _MADE = f"""
