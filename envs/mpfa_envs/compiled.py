@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 numba: Any
@@ -33,10 +36,32 @@ def njit(function: _Function) -> _Function:
         no_cfunc_wrapper=True,
         no_cpython_wrapper=function.__name__.startswith("_"),
     )
-    compiled: Any
+    folder, folder_of_others = _cache_folder(), numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = folder
     try:
-        compiled = decorate(function, cache=True)
-    except RuntimeError:
-        # No folder can be written to, as in a read-only installation without a home.
-        compiled = decorate(function)
+        compiled: Any = decorate(function, cache=bool(folder))
+    finally:
+        numba.config.CACHE_DIR = folder_of_others
     return compiled
+
+
+@cache
+def _cache_folder() -> str:
+    """Return a folder for the compiled loops of these sources; empty if none can be written to."""
+    # Numba looks at the file of a loop alone: a loop that calls another file's, or that takes a
+    # class which moved, would be an older version's or fail to load after an upgrade.
+    package = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        digest.update(source.read_bytes())
+    user_folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    places = [package / "__pycache__", Path(user_folder, "torchrl_mpfa")]
+    for place in [Path(numba.config.CACHE_DIR)] if numba.config.CACHE_DIR else places:
+        folder = place / f"loops-{digest.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return str(folder)
+    return ""

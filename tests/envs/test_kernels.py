@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mpfa_envs
 from mpfa_envs import ROBOTS, WORLDS, Lidar, TaskConfig, World
 from mpfa_envs.compiled import njit
 from mpfa_envs.robots.drives import KinematicDrives
@@ -104,18 +107,32 @@ def test_a_world_replaces_another_whatever_their_sizes() -> None:
 
 
 def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
-    code = (
-        "import numba\n"
-        "real = numba.njit\n"
-        "def reject(*args, cache=False, **kwargs):\n"
-        "    if cache:\n"
-        "        raise RuntimeError('cannot cache function: no locator available')\n"
-        "    return real(*args, **kwargs)\n"
-        "numba.njit = reject\n"
-        "from mpfa_envs.compiled import njit\n"
-        "print(njit(lambda x: 2.0 * x)(3.0))\n"
+    code = "from mpfa_envs.compiled import njit\nprint(njit(lambda x: 2.0 * x)(3.0))\n"
+    assert run(code, NUMBA_CACHE_DIR="/dev/null/none") == "6.0\n"
+
+
+def test_a_loop_is_compiled_again_when_another_file_of_the_package_changed(tmp_path: Path) -> None:
+    package = Path(mpfa_envs.__file__).parent
+    shutil.copytree(package, tmp_path / "mpfa_envs", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "mpfa_envs/inner.py").write_text(
+        "from mpfa_envs.compiled import njit\n@njit\ndef _inner(x):\n    return 2.0 * x\n"
     )
-    assert run(code) == "6.0\n"
+    (tmp_path / "mpfa_envs/outer.py").write_text(
+        "from typing import NamedTuple\nfrom mpfa_envs.compiled import njit\n"
+        "from mpfa_envs.inner import _inner\n"
+        "class Pair(NamedTuple):\n    x: float\n    y: float\n"
+        "@njit\ndef outer(pair):\n    return _inner(pair.x)\n"
+    )
+    code = "from mpfa_envs.outer import Pair, outer\nprint(outer(Pair(3.0, 4.0)))\n"
+    assert run(code, PYTHONPATH=str(tmp_path)) == "6.0\n"
+    assert run(code, PYTHONPATH=str(tmp_path)) == "6.0\n"
+    (tmp_path / "mpfa_envs/inner.py").write_text(
+        "from mpfa_envs.compiled import njit\n@njit\ndef _inner(x):\n    return 5.0 * x\n"
+    )
+    assert run(code, PYTHONPATH=str(tmp_path)) == "15.0\n"
+    moved = (tmp_path / "mpfa_envs/outer.py").read_text().replace("Pair", "Point")
+    (tmp_path / "mpfa_envs/outer.py").write_text(moved)
+    assert run(code.replace("Pair", "Point"), PYTHONPATH=str(tmp_path)) == "15.0\n"
 
 
 def test_a_division_by_zero_is_infinite_as_in_numpy() -> None:
