@@ -49,14 +49,15 @@ def test_quantile_loss_equals_a_loop():
         assert loss.item() == pytest.approx(total / 5, abs=1e-6)
 
 
+@pytest.mark.parametrize("spread", [1.0, 0.0])
 @pytest.mark.parametrize("kind", KINDS)
-def test_learner_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
+def test_learner_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind, spread):
     batch, scale = make_batch(), 0.1
     learner = make_apart(kind, signals=["information_gain", "td_error"], reward_scale=scale)
     noise = learner.networks["noise"]
     with torch.no_grad():
         for weight in noise.parameters():
-            weight.add_(torch.randn(weight.shape, generator=seeded(3)))
+            weight.add_(torch.randn(weight.shape, generator=seeded(3))).mul_(spread)
     log = differentiate(learner, batch, trains="critic")
     quantiles = noise.outputs(batch)["state_action_value"]
     assert quantiles.shape == (6, QUANTILES)

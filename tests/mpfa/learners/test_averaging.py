@@ -25,6 +25,7 @@ def target_of(learner, batch, seed=7):
 @pytest.mark.parametrize("kind", KINDS)
 def test_target_is_the_mean_over_the_present_and_the_earlier_critics(kind):
     learner, batch = make_learner(kind, 3), make_batch(seed=20)
+    learner.update(make_batch(seed=30))
     states = []
     for episode in range(5):
         present = copy.deepcopy(learner.targets["critics"])
