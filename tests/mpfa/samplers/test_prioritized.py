@@ -239,6 +239,14 @@ def test_fresh_rows_do_not_hand_on_their_priority():
     assert buffer.sampler.priorities()[7] == 0.5
 
 
+@pytest.mark.parametrize("slot", range(8))
+def test_fresh_rows_have_the_highest_priority_whatever_its_slot(slot):
+    buffer = make_plain(8)
+    buffer.extend(make_transitions(8))
+    update(buffer, list(range(8)), [9.0 if row == slot else 0.4 for row in range(8)])
+    assert buffer.sampler.default_priority == 9.0
+
+
 def test_the_highest_ever_is_an_option_and_stays():
     buffer = make_plain(4, max_priority_within_buffer=False)
     buffer.extend(make_transitions(4))
