@@ -49,6 +49,13 @@ def test_rows_that_were_overwritten_since_they_were_sampled_are_dropped_and_coun
     assert not table.rows[live, table.column["td_error"]].isnan().any()
 
 
+def test_writes_count_each_row_also_of_a_write_that_is_longer_than_the_buffer():
+    buffer = make_buffer(8, 4)
+    for count in (3, 20, 1):
+        buffer.extend(make_transitions(count))
+    assert buffer.sampler.table.writes == 24
+
+
 def test_a_batch_whose_rows_are_all_gone_changes_nothing():
     buffer = make_filled(8)
     batch = write_signals(buffer.sample())

@@ -35,6 +35,15 @@ def test_one_warning_names_the_cure(sign, share, options):
     assert buffer.sampler.weights["td_error"] == buffer.sampler.weights["action_gradient"] == 0.0
 
 
+def test_rewards_up_to_the_level_are_on_one_side_of_it():
+    buffer, rows = make_buffer(2000, 32, entropy_refresh=0, positive_above=-1.0), pendulum()
+    rows["next", "reward"][::2] = -1.0
+    rows["next", "reward"].clamp_(max=-1.0)
+    buffer.extend(rows)
+    with pytest.warns(UserWarning, match="none of the 1200 rewards in the buffer are above -1.0"):
+        train_rounds(buffer, 5)
+
+
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 @pytest.mark.parametrize("level", ["mean", -8.0])
 def test_the_cure_gives_every_signal_its_weight(level):

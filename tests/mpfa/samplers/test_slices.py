@@ -270,6 +270,18 @@ def test_trajectories_of_a_collector_are_kept_apart_even_without_their_ends(ndim
     collector.shutdown()
 
 
+def test_trajectories_are_kept_apart_where_the_next_one_begins_as_the_last_one_ended():
+    storage, sampler = SignalTensorStorage(8), SignalSliceSampler(8, ALPHA, BETA, slice_len=2)
+    buffer = make_buffer(8, 2, storage=storage, sampler=sampler)
+    still, end = torch.zeros(8, 1), torch.zeros(8, 1, dtype=torch.bool)
+    after = {"observation": still, "reward": still, "done": end}
+    steps = TensorDict({"observation": still, "next": after}, [8])
+    steps["collector", "traj_ids"] = torch.tensor([0, 0, 0, 0, 1, 1, 1, 1])
+    buffer.extend(steps)
+    joined = [True, True, True, False, True, True, True, False]
+    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == joined
+
+
 def test_rows_of_several_environments_in_turn_are_no_trajectory():
     buffer = make_slices(ndim=1, traj_key="robot")
     rows = make_steps(0, 10)
