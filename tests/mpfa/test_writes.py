@@ -230,8 +230,9 @@ def test_first_priorities_of_any_real_type_are_taken(kind, shape):
     buffer = make_buffer(CAPACITY)
     rows = make_full_transitions(2)
     rows["td_error"] = torch.tensor([1, 0]).reshape(shape).to(kind)
-    buffer.extend(rows)
-    assert buffer.sampler.priorities()[:2].tolist() == pytest.approx([1.05, 0.05])
+    for _ in range(2):
+        buffer.extend(rows)
+    assert buffer.sampler.priorities()[:4].tolist() == pytest.approx([1.05, 0.05] * 2)
 
 
 @pytest.mark.parametrize("shape", [(), (4,)])
