@@ -123,7 +123,6 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             or writer.tracks_generations
             or self._allow_nonfinite
             or len(self._transform)
-            or data.get(self.priority_key, None) is not None
             or any(other is not self for other in storage._attached_entities_iter())
         ):
             return None
