@@ -69,11 +69,12 @@ def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
     return found.reshape(levels.shape)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_path_is_the_cheapest_after_every_scan(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "mount"), [(0, (0.0, 0.0)), (1, (0.1, 0.2))])
+def test_the_path_is_the_cheapest_after_every_scan(seed: int, mount: tuple[float, float]) -> None:
     rng = np.random.default_rng(seed)
     world = random_shapes(rng, boxes=4, cylinders=4)
-    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
+    lidar = Lidar(world, mount=mount)
+    memory = MapMemory(1, ROBOT, lidar)
     memory.begin(0, world)
     goal, points = (3.9, 2.9), []
     pose = np.array([-4.0, -3.0, 0.0])
@@ -81,8 +82,10 @@ def test_the_path_is_the_cheapest_after_every_scan(seed: int) -> None:
         angles = pose[2] + lidar.angles
         ranges = lidar.cast(*pose)
         met = ranges < lidar.max_range
+        forward = np.array([math.cos(pose[2]), math.sin(pose[2])])
+        sensor = pose[:2] + mount[0] * forward + mount[1] * np.array([-forward[1], forward[0]])
         points += [
-            pose[:2] + r * np.array([math.cos(a), math.sin(a)])
+            sensor + r * np.array([math.cos(a), math.sin(a)])
             for r, a in zip(ranges[met], angles[met], strict=True)
         ]
         path = scan(memory, lidar, tuple(pose), goal)
