@@ -10,6 +10,7 @@ from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, generate_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid, is_reachable
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
 from mpfa_envs.paths.tasks import sample_task_on_grid
+from mpfa_envs.tasks.sampling import sample_task
 
 MIXED = World(
     name="mixed",
@@ -173,6 +174,16 @@ def test_tasks_are_detours_as_often_as_asked() -> None:
         assert low <= np.mean(around) <= high
     open_room = FreeGrid(WORLDS["A"], distance=0.25)
     sample_task_on_grid(open_room, rng, detour_chance=1.0)
+
+
+@pytest.mark.parametrize(("chance", "share"), [(1.0, 1.0), (0.0, 0.3)])
+def test_tasks_of_any_distance_are_detours_as_often_as_asked(chance: float, share: float) -> None:
+    rng, world = np.random.default_rng(0), generate_world("bars", 3, difficulty=0.7)
+    tasks = [
+        sample_task(world, rng, collision_distance=0.25, detour_chance=chance) for _ in range(30)
+    ]
+    blocked = [world.clearance_along(task.start[:2], task.goal) < 0.25 for task in tasks]
+    assert np.mean(blocked) == pytest.approx(share, abs=0.15)
 
 
 def test_a_task_lies_on_one_side_of_a_closed_wall() -> None:
