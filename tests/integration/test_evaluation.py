@@ -306,6 +306,7 @@ def test_a_plan_and_a_goal_radius_shorten_and_lengthen_the_drives(
 
 def test_worlds_and_their_label_agree() -> None:
     assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
+    assert parse_worlds(["rooms:100-100"]) == ["rooms-100"]
     tests = [f"{name}:test" for name in GENERATORS if name not in ("mixed", "crowd")]
     assert parse_worlds(["all", "barn"]) == [*tests, "barn"]
     words = (["test"], ["test", "A"], ["a/w.yaml"], ["b/w.yaml"])

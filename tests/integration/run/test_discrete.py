@@ -19,6 +19,7 @@ LEARNERS = ["dqn", "q_learning"]
 def test_a_run_learns_from_choices_and_saves_a_policy_that_drives_them(tmp_path, learner):
     settings = tiny(learner=learner, robots=2, updates=2)
     settings.environment.max_steps, settings.method.capacity = 25, 100
+    settings.environment.filter = 1.0  # Of actions that are wheel speeds.
     check_settings(settings)
     run = train(tmp_path, settings)
     assert run.learner.updates > 50

@@ -18,6 +18,7 @@ from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.checkpoints import save
+from training.run.loggers import WandbLog
 from training.run.loop import TrainingRun
 from training.run.tracking import Tracker, show_policy
 from training.settings.command_line import composed
@@ -276,10 +277,16 @@ def test_what_evaluate_py_finds_is_in_the_wandb_run_of_the_training(
     assert [line[0] for line in row["evaluate/A+B-kinematic/worlds"].data] == ["A", "B", "total"]
     assert "evaluate/A+B-kinematic/paths" not in row
     assert f"in wandb, too: wandb sync {tmp_path}/wandb/offline-run-" in capsys.readouterr().out
+    # What is found late, and of an earlier checkpoint, is no reason to log anything again.
+    (count,) = (tmp_path / "wandb").glob("logged-*.txt")
+    entries, actions = count.read_text().split()
+    log = WandbLog(settings, tmp_path, run_id=run.tracker.run_id)
+    log.log({"evaluate/A/success": 1.0}, run.actions - 1)
+    assert count.read_text().split() == [str(int(entries) + 1), actions]
     # A run without wandb begins none.
     (tmp_path / "wandb").rename(tmp_path / "elsewhere")
     evaluate.main([*how, "--no-pictures"])
-    assert len(kept.rows) == before + 1 and not (tmp_path / "wandb").exists()
+    assert len(kept.rows) == before + 2 and not (tmp_path / "wandb").exists()
 
 
 @pytest.mark.parametrize("every", [None, 0, 20])
