@@ -159,6 +159,11 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         ),
         (
             tune.main,
+            "evaluation.every=30001",
+            "evaluation.every must be from 1 to the 30000 actions",
+        ),
+        (
+            tune.main,
             "evaluation.world=test evaluation.choose=false",
             "evaluation.world must not be of a test, got test",
         ),

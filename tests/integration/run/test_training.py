@@ -33,6 +33,7 @@ from training.files import CHECKPOINT
 from training.records import EvaluationRecord
 from training.run import loop
 from training.run.checkpoints import random_state, read_checkpoint, set_random_state
+from training.run.driving import Robots
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.train import GROUPS, Stage, TrainSettings
@@ -163,6 +164,20 @@ def test_a_finished_run_begins_further_worlds_as_its_curriculum_says(tmp_path: P
     assert resumed.train()
     resumed.close()
     assert len(resumed.buffer) == sum(record.steps for record in resumed.records[3:])
+
+
+def test_two_stages_in_one_world_have_other_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds, begin = [], Robots.begin
+
+    def kept(self: Robots, *args: object, seed: int) -> None:
+        seeds.append(seed)
+        begin(self, *args, seed=seed)
+
+    monkeypatch.setattr(Robots, "begin", kept)
+    train(tmp_path, tiny("uniform", episodes=[Stage("A", 1), Stage("A", 1)]))
+    assert len({*seeds}) == 2
 
 
 def test_the_episodes_that_another_stage_cuts_short_are_counted(tmp_path: Path) -> None:
