@@ -56,6 +56,7 @@ def test_runs_of_a_gymnasium_task_leave_scores_that_are_reported(tmp_path: Path)
     assert "## Pendulum-v1" in text and "| sac/mpfa − sac/uniform |" in text
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_saves_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,8 +18,6 @@ HEAVY = ("torchrl", "wandb", "matplotlib", "pandas")
     [
         ("train.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
         ("train.py", "curriculum.stages=[{world:A,action:500}]", "did you mean 'actions'?"),
-        ("train.py", "seed=abc", "seed: Value 'abc'"),
-        ("compare.py", "environment.robt=burger", "did you mean 'environment.robot'?"),
         ("evaluate.py", "td3-room", "there is no policy at td3-room"),
         ("report.py", "runs/nowhere", "there is no runs/nowhere"),
     ],

@@ -185,6 +185,7 @@ def test_train_reads_the_best_settings_and_its_command_line_wins(
     assert settings.method.batch_size == best["method.batch_size"]
 
 
+@pytest.mark.slow
 def test_a_search_that_broke_off_goes_on_to_the_trials_that_it_would_have_had(
     tmp_path: Path, ranges: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,6 +272,7 @@ def test_trials_that_fail_are_told_and_three_in_a_row_end_the_search(
     assert list(trials_of(tmp_path / "tune")["state"][6:]) == ["COMPLETE"] * 3
 
 
+@pytest.mark.slow
 def test_a_study_on_a_full_disk_ends_in_one_line_and_goes_on_as_if_never_stopped(
     tmp_path: Path,
     ranges: Path,

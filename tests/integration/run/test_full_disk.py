@@ -84,6 +84,7 @@ def logs(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_run_that_saved_nothing_leaves_whole_rows_and_begins_again_as_if_never_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Callable[[], list[str]]
 ) -> None:
@@ -99,6 +100,7 @@ def test_run_that_saved_nothing_leaves_whole_rows_and_begins_again_as_if_never_s
     assert logs(tmp_path / "run") == logs(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_run_whose_log_is_cut_in_an_iteration_resumes_with_the_whole_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,11 +114,16 @@ def test_program_takes_the_same_forty_steps(name, options):
 @pytest.mark.parametrize(
     ("name", "through_file", "to_compiled", "updates"),
     [  # Each value of one with each of another.
-        ("ddpg", False, False, 0),
         ("ddpg", True, True, 4),
         ("td3", False, True, 4),
-        ("td3", True, False, 4),
-        ("td3", True, True, 0),
+        *(
+            pytest.param(*values, marks=pytest.mark.slow)
+            for values in (
+                ("ddpg", False, False, 0),
+                ("td3", True, False, 4),
+                ("td3", True, True, 0),
+            )
+        ),
     ],
 )
 def test_checkpoint_of_an_eager_or_compiled_learner_loads_in_the_other(

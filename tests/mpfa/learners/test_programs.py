@@ -51,10 +51,15 @@ def test_learners_of_equal_settings_share_programs_and_learn_as_alone(name):
     "options",
     [
         {"gamma": 0.5},
-        {"loss_function": "smooth_l1"},
         {"networks": make_networks(width=17)},
-        {"networks": make_networks(layer_norm=False)},
-        {"policy_noise": 0.3, "bounds": BOUNDS},
+        *(
+            pytest.param(options, marks=pytest.mark.slow)
+            for options in (
+                {"loss_function": "smooth_l1"},
+                {"networks": make_networks(layer_norm=False)},
+                {"policy_noise": 0.3, "bounds": BOUNDS},
+            )
+        ),
     ],
     ids=lambda options: "-".join(options),
 )
