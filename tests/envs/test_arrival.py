@@ -13,7 +13,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import ROBOTS, Box, RobotModel, World
 from mpfa_envs.deploy import Pilot, Scan
-from mpfa_envs.deploy.map_path import placed
+from mpfa_envs.deploy.map_path import plan_at
 from mpfa_envs.robots.drives import KinematicDrives
 from tests.envs.exported import card
 from tests.envs.test_deploy_filter import ALL_ROUND, KOBUKI, a_pilot, wall_at
@@ -69,7 +69,7 @@ def test_angles_in_degrees_are_answered_by_the_ones_meant() -> None:
     with pytest.raises(ValueError, match=r"heading must be at most 6.283 rad .* did you mean 1.57"):
         pilot.begin((2.0, 0.0), heading=90.0)
     with pytest.raises(ValueError, match=r"plan_pose must be .* did you mean 1.571, which is 90"):
-        placed(World(name="empty"), (0.0, 0.0, 90.0))
+        plan_at(World(name="empty"), (0.0, 0.0, 90.0))
 
 
 def test_a_heading_needs_a_robot_that_turns_on_the_spot() -> None:

@@ -36,8 +36,8 @@ def pair_of(name: str, place: tuple[float, float]) -> tuple[float, float]:
     return x, y
 
 
-def placed(world: World, pose: tuple[float, float, float]) -> Plan:
-    """A plan at a pose."""
+def plan_at(world: World, pose: tuple[float, float, float]) -> Plan:
+    """Return the plan of a world at a pose."""
     if not isinstance(world, World):
         # The text of any other object may have an address in memory.
         given = repr(world) if isinstance(world, str | Path) else type(world).__name__

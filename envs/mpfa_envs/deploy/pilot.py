@@ -11,7 +11,7 @@ from mpfa_envs.checks import check_not_negative, check_number, check_positive
 from mpfa_envs.deploy.adaptation import body_of, filter_of, pace_of, tolerance
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
-from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, placed, sides_of
+from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
 from mpfa_envs.robots.drives import Orders
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
@@ -213,7 +213,7 @@ class Pilot:
                     "plan must be None for a policy without a map (memory='map'), and with a "
                     f"map_center, got {plan.name!r}"
                 )
-            ground = placed(plan, plan_pose)
+            ground = plan_at(plan, plan_pose)
             center = ground.middle
         check_on_map(goal, center, ground, self._map_size)
         self._arrival.begin(heading)
@@ -258,7 +258,7 @@ class Pilot:
         """
         if self._plan is None:
             raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
-        moved = placed(self._plan.world, pose)
+        moved = plan_at(self._plan.world, pose)
         if self._plan.is_off(moved.pose):
             self._plan, self._center, self._fresh_map = moved, moved.middle, True
 

@@ -143,18 +143,18 @@ class Lidar:
             worlds: That of each robot.
             ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
         """
-        view, motions = math.radians(self.field_of_view), self.placed(motions)
+        view, motions = math.radians(self.field_of_view), self.sensor_motions(motions)
         cast_rays(motions, chosen, worlds, self._directions, view, self.max_range, ranges)
 
-    def placed(self, motions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses of the sensors of many robots, in the first three columns as for the robots."""
+    def sensor_motions(self, motions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the poses of all sensors, in the first three columns as those of robots."""
         x, y = self.mount
         if not (x or y):
             return motions
-        placed, cosine, sine = motions.copy(), np.cos(motions[:, 2]), np.sin(motions[:, 2])
-        placed[:, 0] += x * cosine - y * sine
-        placed[:, 1] += x * sine + y * cosine
-        return placed
+        sensors, cosine, sine = motions.copy(), np.cos(motions[:, 2]), np.sin(motions[:, 2])
+        sensors[:, 0] += x * cosine - y * sine
+        sensors[:, 1] += x * sine + y * cosine
+        return sensors
 
     def around_center(
         self, ranges: NDArray[np.float64]

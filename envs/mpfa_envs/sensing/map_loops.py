@@ -54,7 +54,7 @@ class MapArrays(NamedTuple):
 
 
 @njit
-def remember(
+def enter_scans(
     motions: NDArray[np.float64],  # x, y, heading first [m, m, rad], [N, 5]
     taken: NDArray[np.float64],  # where the scans were taken, as motions
     goals: NDArray[np.float64],  # x, y [m], [N, 2]

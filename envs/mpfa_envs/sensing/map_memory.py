@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, cell_of, follow_path, remember
+from mpfa_envs.sensing.map_loops import (
+    BLOCKED,
+    UNKNOWN,
+    MapArrays,
+    cell_of,
+    enter_scans,
+    follow_path,
+)
 from mpfa_envs.worlds.arrays import grown
 
 if TYPE_CHECKING:
@@ -156,7 +163,7 @@ class MapMemory:
         directions = self._directions if directions is None else directions
         taken = motions if taken is None else taken
         how = self.arrays, self._lengths, self._mount
-        remember(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
+        enter_scans(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
 
     def known_map(self, index: int, x: float, y: float) -> KnownMap:

@@ -307,5 +307,7 @@ class WalkerBatch:
         seen = ranges.copy()
         directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         margin = _MARGIN + 3 * lidar.noise
-        hide_walkers(self._arrays, lidar.placed(motions), directions, margin, lidar.max_range, seen)
+        hide_walkers(
+            self._arrays, lidar.sensor_motions(motions), directions, margin, lidar.max_range, seen
+        )
         return seen
