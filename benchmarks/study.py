@@ -1,4 +1,4 @@
-"""Make the pictures of the study's tables, and of the cliffwalk, from the rows that are kept.
+"""Make the pictures of the study's tables, the cliffwalk and MuJoCo, of the rows that are kept.
 
     python -m benchmarks.study              to docs/results/study and docs/images
     python -m benchmarks.study L --output runs/new
@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs.render.charts import Curve, finish, looks, new_figure, seed_band
+from training.comparison.scores import runs_by_task
+from training.figures import plot_scores
 from training.files import run_script
 from training.records import area_under, read_table
 from training.statistics import mean_interval
@@ -158,18 +160,24 @@ def plot_cliffwalk(path: Path) -> None:
     finish(figure, [axis], path)
 
 
+def plot_mujoco(path: Path) -> None:
+    """Plot the scores of each task of MuJoCo over the steps."""
+    plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path, columns=1)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the pictures that are asked for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.study", description=__doc__)
-    known = [*PANELS, "cliffwalk"]
+    images = {"cliffwalk": plot_cliffwalk, "mujoco": plot_mujoco}
+    known = [*PANELS, *images]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"among {', '.join(known)}")
     parser.add_argument("--output", type=Path, default=None, help="folder")
     options: Any = parser.parse_args(arguments)
     if unknown := [name for name in options.names if name not in known]:
         parser.error(f"there is no picture {unknown[0]!r}: choose from {', '.join(known)}")
     for name in options.names or known:
-        if name == "cliffwalk":
-            plot_cliffwalk((options.output or ROOT / "docs/images") / "cliffwalk.png")
+        if name in images:
+            images[name]((options.output or ROOT / "docs/images") / f"{name}.png")
         else:
             plot_table(name, (options.output or KEPT / "study") / f"{name}.png")
     return 0

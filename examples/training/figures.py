@@ -49,15 +49,18 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
     plot_seeds(curves, path, ylabel=ylabel, band="runs" if few else "interval")
 
 
-def plot_scores(tasks: Mapping[str, Mapping[str, Mapping[str, Curve]]], path: Path) -> None:
+def plot_scores(
+    tasks: Mapping[str, Mapping[str, Mapping[str, Curve]]], path: Path, *, columns: int = 3
+) -> None:
     """Plot the curves of each task in a panel of its own, a method in the same color in all.
 
     Args:
         tasks: Curves by task, method and run.
         path: The PNG file.
+        columns: Panels side by side at most.
     """
     methods = dict.fromkeys(method for runs in tasks.values() for method in runs)
-    columns = min(len(tasks), 3)
+    columns = min(len(tasks), columns)
     figure, axes = new_figure(-(-len(tasks) // columns), columns, panel=(5.0, 3.6))
     for axis, (task, runs) in zip(axes, tasks.items(), strict=False):
         # A method without a run here keeps its color.

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import study
+from training.comparison.scores import runs_by_task, score_tables
 from training.records import area_under
 
 STUDY = Path(__file__).resolve().parents[2] / "docs/results/study"
@@ -47,9 +48,17 @@ def test_the_arms_of_a_panel_have_rows_and_differ(table: str) -> None:
         assert len(set(arms.values())) == len(arms)
 
 
+def test_the_tables_of_mujoco_are_those_of_the_kept_rows() -> None:
+    page = (STUDY.parent / "mujoco.md").read_text(encoding="utf-8")
+    for task, runs in runs_by_task([study.KEPT / "mujoco.csv"]).items():
+        assert {len(seeds) for seeds in runs.values()} == {5}
+        assert "\n\n".join((f"## {task}", *score_tables(runs)[1:])) in page
+
+
 def test_a_picture_is_made_of_the_kept_rows(tmp_path: Path) -> None:
-    assert study.main(["L", "cliffwalk", "--output", str(tmp_path)]) == 0
-    for kept in (STUDY / "L.png", STUDY.parents[1] / "images/cliffwalk.png"):
+    assert study.main(["L", "cliffwalk", "mujoco", "--output", str(tmp_path)]) == 0
+    images = (STUDY.parents[1] / f"images/{name}.png" for name in ("cliffwalk", "mujoco"))
+    for kept in (STUDY / "L.png", *images):
         with Image.open(tmp_path / kept.name) as new, Image.open(kept) as old:
             assert new.size == old.size
             assert (np.asarray(new) == np.asarray(old)).mean() > 0.99

@@ -36,11 +36,16 @@ def write_scores(paths: Sequence[Path], output: Path) -> str:
         ValueError: If there are no scores, a table is damaged, or the output is no folder.
     """
     files.check_folder(output)
-    tasks = {str(task): runs_of(found) for task, found in read_scores(paths).groupby("task")}
+    tasks = runs_by_task(paths)
     parts = [part for task, runs in tasks.items() for part in (f"## {task}", *score_tables(runs))]
     text = write_tables([*parts, f"![Scores over steps: mean of the runs]({CURVES})"], output)
     plot_scores(tasks, output / CURVES)
     return text
+
+
+def runs_by_task(paths: Sequence[Path]) -> dict[str, Runs]:
+    """Read tables of scores as curves by task, method and seed."""
+    return {str(task): runs_of(found) for task, found in read_scores(paths).groupby("task")}
 
 
 def read_scores(paths: Sequence[Path]) -> pd.DataFrame:
