@@ -270,6 +270,7 @@ def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
     assert document["worlds"]["A"]["timeout"] == 1.0
 
 
+@pytest.mark.slow
 def test_pictures_without_room_leave_those_before_and_name_their_folder(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

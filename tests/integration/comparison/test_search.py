@@ -238,6 +238,7 @@ def test_a_trial_is_the_mean_of_a_run_with_each_seed(
         assert row["value"] == pytest.approx(share * last, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_learner_and_the_method_may_be_searched(tmp_path: Path) -> None:
     ranges = tmp_path / "ranges.yaml"
     ranges.write_text("method: [per, uniform]\nlearner: [ddpg, td3]\n")
