@@ -132,7 +132,7 @@ def check_contents(wheel: Path) -> None:
     for package, source in zip(PACKAGES, (ROOT, ROOT / "envs"), strict=True):
         needed = (path for path in (source / package).rglob("*") if path.is_file())
         missing = {
-            str(path.relative_to(source)) for path in needed if path.parent.name != "__pycache__"
+            str(path.relative_to(source)) for path in needed if "__pycache__" not in path.parts
         } - names
         if missing:
             raise SystemExit(f"the wheel lacks {sorted(missing)}")
