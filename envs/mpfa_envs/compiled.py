@@ -40,6 +40,8 @@ def njit(function: _Function) -> _Function:
     numba.config.CACHE_DIR = folder
     try:
         compiled: Any = decorate(function, cache=bool(folder))
+    except RuntimeError:  # Its source is no file.
+        compiled = decorate(function)
     finally:
         numba.config.CACHE_DIR = folder_of_others
     return compiled

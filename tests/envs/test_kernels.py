@@ -106,9 +106,10 @@ def test_a_world_replaces_another_whatever_their_sizes() -> None:
     assert batch[0] is world and len(batch) == 2
 
 
-def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
+@pytest.mark.parametrize("folder", ["/dev/null/none", ""])
+def test_a_function_is_compiled_where_it_cannot_be_cached(folder: str) -> None:
     code = "from mpfa_envs.compiled import njit\nprint(njit(lambda x: 2.0 * x)(3.0))\n"
-    assert run(code, NUMBA_CACHE_DIR="/dev/null/none") == "6.0\n"
+    assert run(code, NUMBA_CACHE_DIR=folder) == "6.0\n"
 
 
 def test_a_loop_is_compiled_again_when_another_file_of_the_package_changed(tmp_path: Path) -> None:
