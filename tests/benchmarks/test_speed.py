@@ -7,12 +7,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
+import torch
+from tensordict import TensorDict
 
 from benchmarks.speed import __main__ as run
 from benchmarks.speed import (
     disk,
+    gpu,
     method_steps,
     profile,
     replay,
@@ -186,3 +190,18 @@ def test_a_step_is_made_of_methods_that_store_or_choose_in_a_way_of_their_own(na
     step = method_steps.make_step(replace(METHODS[name]))
     for _ in range(2):
         step()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="measures on the GPU")
+def test_without_a_gpu_its_timings_say_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gpu.main() == 1
+    assert "no GPU was found" in capsys.readouterr().err
+
+
+def test_a_round_on_its_devices_makes_its_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    monkeypatch.setattr(gpu, "CAPACITY", 512)
+    round_of_updates = gpu.make_updates("cpu", "cpu", width=8, batch_size=16)
+    assert gpu.milliseconds(round_of_updates, rounds=1) > 0.0
+    log, batch = cast(tuple[dict[str, torch.Tensor], TensorDict], round_of_updates())
+    assert len(batch) == 16 and all(value.isfinite().all() for value in log.values())
