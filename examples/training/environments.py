@@ -113,6 +113,7 @@ class FilteredRobots:
     def __init__(self, settings: TrainSettings) -> None:
         task = settings.environment
         self._share = 0.0 if is_discrete(settings.learner) else task.filter
+        self._cost = task.filter_cost
         self._keep = TaskConfig(**env_arguments(task)).make_filter() if self._share else None
 
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
@@ -123,7 +124,15 @@ class FilteredRobots:
         some = slice(math.ceil(self._share * len(actions)))
         kept = self._keep(state["observation"][some].numpy(), actions[some].numpy())
         actions[some] = torch.from_numpy(kept)
+        self._chosen = state["action"]
         return state.set("action", actions)
+
+    def charge(self, state: TensorDictBase) -> None:
+        """Store what was chosen in place of what was carried out, at the cost of the change."""
+        if self._keep is not None and self._cost is not None:
+            change = (state["action"] - self._chosen).abs().amax(-1, keepdim=True)
+            state["next", "reward"] -= self._cost * change
+            state.set("action", self._chosen)
 
 
 def vector_of(env: EnvBase) -> VectorNavigationEnv:

@@ -114,6 +114,7 @@ class Robots:
         state, self._state = self._env.step_and_maybe_reset(
             self._act(explorer, self._state, actions, entries)
         )
+        self._filter.charge(state)
         if "episode" in entries:
             state.set("episode", self._numbers.clone())
         total = actions + self.count

@@ -61,6 +61,9 @@ def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> 
     with named("environment.noise."):
         RobotNoise(**asdict(environment.noise))
     with named("environment."):
+        cost = environment.filter_cost
+        if cost is not None and not environment.filter:
+            raise ValueError(f"filter_cost must be null where environment.filter is 0, got {cost}")
         task = TaskConfig(**task_arguments(environment))
         if environment.mirror:
             task.make_mirror()

@@ -79,8 +79,12 @@ class EnvironmentSettings:
     greatest, ``[0.0,0.2]``, between which each episode has its own; null: the robot's."""
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off obstacles
-    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With 1
+    (:class:`mpfa_envs.SafetyFilter`); ``filter_cost`` says which action is stored. With 1
     evaluations have the filter, too, and a policy needs it. DQN and Q learning have none."""
+    filter_cost: float | None = setting(None, NOT_NEGATIVE)
+    """Cost of an action that the filter changes, times the larger change of the two wheels; also of
+    0 the buffer stores the action that was chosen, so that the critic learns what the filter
+    refuses (``docs/results/sparse.md``). Null: it stores what was carried out."""
     mirror: bool = True
     """Show the learner half of its samples in the mirror, which also swaps front and rear where a
     robot has them alike."""

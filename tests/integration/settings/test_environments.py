@@ -98,6 +98,28 @@ def test_what_the_filter_lets_pass_is_carried_out_and_stored(
     assert (collisions > 0) == (some < 8)
 
 
+def test_with_a_cost_what_was_chosen_is_stored_and_what_the_filter_changed_is_charged() -> None:
+    settings = tiny(robots=8)
+    settings.exploration.random_steps = 0
+    free = EnvironmentSettings(robot="kobuki", physics="kinematic", filter=0.6, step_cost=0.05)
+    driven: dict[float | None, Any] = {}
+    for cost in (None, 0.0, 0.5):
+        settings.environment = replace(free, filter_cost=cost)
+        robots = Robots(settings)
+        robots.begin("mazes", Ahead(), seed=1)
+        steps = [robots.drive(Ahead(), actions=8 * step, episode=0)[0] for step in range(60)]
+        driven[cost] = torch.stack(steps)
+        robots.close()
+    without, free_of_cost, charged = driven[None], driven[0.0], driven[0.5]
+    assert torch.equal(charged["next", "observation"], without["next", "observation"])
+    assert (charged["action"] == 1.0).all() and (free_of_cost["action"] == 1.0).all()
+    assert torch.equal(free_of_cost["next", "reward"], without["next", "reward"])
+    change = (without["action"] - 1.0).abs().amax(-1, keepdim=True)
+    paid = without["next", "reward"] - charged["next", "reward"]
+    assert paid == pytest.approx(0.5 * change, abs=1e-6)
+    assert change[:, :5].count_nonzero() > 20 and not change[:, 5:].any()
+
+
 @pytest.mark.parametrize(
     ("robot", "repeat"),
     [("kobuki", 2), ("turtlebot2", 2), ("turtlebot4", 4), ("waffle", 5), ("burger", 6)],

@@ -269,6 +269,10 @@ def test_setting_with_a_bad_value_is_rejected_by_name_in_one_sentence(
         ),
         ("method=ddpg method.reliability=0.2", "this method has no method.reliability, but name, "),
         ("method=reaper method.hindsight=2", "method.hindsight must be 0 with reaper, .* got 2"),
+        (
+            "regime=paper environment.filter_cost=1",
+            "environment.filter_cost must be null where environment.filter is 0, got 1",
+        ),
         ("method.name=mine", "unknown method 'mine'"),
         (
             "curriculum=A environment.clearance=4.9",
