@@ -1,4 +1,4 @@
-"""Make the pictures of the study's tables, the cliffwalk and MuJoCo, of the rows that are kept.
+"""Make the pictures of the study's tables, the cliffwalk, MuJoCo and sparse rewards, of kept rows.
 
     python -m benchmarks.study              to docs/results/study and docs/images
     python -m benchmarks.study L --output runs/new
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mpfa_envs.render.charts import Curve, finish, looks, new_figure, seed_band
+from mpfa_envs.render.charts import Curve, draw_seeds, finish, looks, new_figure, seed_band
 from training.comparison.scores import runs_by_task
 from training.figures import plot_scores
 from training.files import run_script
@@ -165,10 +165,24 @@ def plot_mujoco(path: Path) -> None:
     plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path, columns=1)
 
 
+def plot_sparse(path: Path) -> None:
+    """Plot success in validation worlds of sparse rewards: near goals, simple, before."""
+    tasks = runs_by_task([KEPT / "sparse.csv"])
+    runs = dict(tasks["near goals, validation"])
+    for regime in ("simple", "before"):
+        [runs[f"PER with hindsight, {regime}"]] = tasks[f"{regime}, validation"].values()
+    curves = {name: list(of_method.values()) for name, of_method in runs.items()}
+    figure, (axis,) = new_figure(panel=(6.6, 4.2))
+    draw_seeds(axis, curves, limits=(0.0, 1.0))
+    axis.set(xlabel="actions", ylabel="success in validation worlds")
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    finish(figure, [axis], path)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the pictures that are asked for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.study", description=__doc__)
-    images = {"cliffwalk": plot_cliffwalk, "mujoco": plot_mujoco}
+    images = {"cliffwalk": plot_cliffwalk, "mujoco": plot_mujoco, "sparse": plot_sparse}
     known = [*PANELS, *images]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"among {', '.join(known)}")
     parser.add_argument("--output", type=Path, default=None, help="folder")

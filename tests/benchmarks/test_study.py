@@ -55,9 +55,12 @@ def test_the_tables_of_mujoco_are_those_of_the_kept_rows() -> None:
         assert "\n\n".join((f"## {task}", *score_tables(runs)[1:])) in page
 
 
+IMAGES = ("cliffwalk", "mujoco", "sparse")
+
+
 def test_a_picture_is_made_of_the_kept_rows(tmp_path: Path) -> None:
-    assert study.main(["L", "cliffwalk", "mujoco", "--output", str(tmp_path)]) == 0
-    images = (STUDY.parents[1] / f"images/{name}.png" for name in ("cliffwalk", "mujoco"))
+    assert study.main(["L", *IMAGES, "--output", str(tmp_path)]) == 0
+    images = (STUDY.parents[1] / f"images/{name}.png" for name in IMAGES)
     for kept in (STUDY / "L.png", *images):
         with Image.open(tmp_path / kept.name) as new, Image.open(kept) as old:
             assert new.size == old.size
