@@ -84,7 +84,8 @@ class EnvironmentSettings:
     filter_cost: float | None = setting(None, NOT_NEGATIVE)
     """Cost of an action that the filter changes, times the larger change of the two wheels; also of
     0 the buffer stores the action that was chosen, so that the critic learns what the filter
-    refuses (``docs/results/study.md``). Null: it stores what was carried out."""
+    refuses. Null: it stores what was carried out. No difference was found
+    (``docs/results/sparse.md``)."""
     mirror: bool = True
     """Show the learner half of its samples in the mirror, which also swaps front and rear where a
     robot has them alike."""

@@ -11,12 +11,15 @@ import torch
 from mpfa_envs import evaluate
 from training.run.evaluations import exported_policy
 from training.run.loop import TrainingRun
+from training.settings.command_line import composed
 from training.settings.train import (
     GROUPS,
     CurriculumSettings,
     EnvironmentSettings,
+    EvaluationSettings,
     Stage,
     TrainSettings,
+    register,
 )
 
 pytestmark = pytest.mark.slow
@@ -92,3 +95,15 @@ def test_a_broken_learner_does_not_pass_for_one_that_works(broken: str, tmp_path
     # Either leaves a critic that says nothing of what lies ahead.
     setattr(settings.learner, broken, {"critic_lr": 1e-9, "gamma": 0.0}[broken])
     assert train(settings, tmp_path) < WELL_TRAINED
+
+
+def test_the_settings_of_sparse_rewards_reach_goals_in_new_rooms_to_the_end(tmp_path: Path) -> None:
+    register()
+    file = Path(__file__).parents[3] / "examples/sparse.yaml"
+    [settings] = composed([f"settings={file}", "seed=600", "tracking=off"])
+    settings.evaluation = EvaluationSettings(12_000, "mixed:validation", 40)
+    torch.set_num_threads(1)
+    run = TrainingRun(settings, tmp_path)
+    run.train()
+    run.close()
+    assert [found.success > WELL_TRAINED for found in run.evaluations] == [True, True]
