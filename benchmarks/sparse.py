@@ -23,12 +23,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-import compare
 from mpfa_envs import Policy, TaskConfig, VectorNavigationEnv, load_policy
 from training import files
+from training.comparison.execution import make_runs
+from training.comparison.jobs import Comparison, Evaluation
 from training.comparison.report import difference_table, interval, table
 from training.comparison.scores import COLUMNS, runs_by_task
 from training.records import area_under, read_table, write_table
+from training.settings.train import register
 from training.statistics import mean_interval
 from training.worlds import family
 
@@ -101,14 +103,11 @@ def make(arm: str, folder: Path, seeds: Sequence[int], jobs: int) -> int:
     """Train and evaluate the runs of an arm; return the exit status."""
     regime, name = ARMS[arm]
     method, goals = METHODS[name]
-    return compare.main(
-        [
-            *("--folder", str(folder_of(arm, folder)), "--methods", method),
-            *("--seeds", *map(str, seeds), "--jobs", str(jobs), "--worlds", *WORLDS),
-            *("--episodes", str(_EPISODES), "--physics", "kinematic"),
-            *("--", *SETTINGS, *REGIMES[regime], f"method.hindsight={goals}"),
-        ]
-    )
+    words = (*SETTINGS, *REGIMES[regime], f"method.hindsight={goals}")
+    judged = Evaluation(WORLDS, episodes=_EPISODES, physics="kinematic")
+    register()
+    runs = Comparison(folder_of(arm, folder), (method,), words, seeds, evaluation=judged)
+    return make_runs(runs, most=jobs)
 
 
 def rows_of(arm: str, folder: Path) -> Iterator[tuple[Any, ...]]:

@@ -133,7 +133,8 @@ def test_every_command_on_the_pages_is_understood(
     best = tmp_path / "runs/tune/best.yaml"
     best.parent.mkdir(parents=True)
     best.write_text("learner.tau: 0.01\n")
-    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    for name in ("docs", "examples"):
+        (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     # A page names a plugin, which registers a method.
     Path("mine.py").write_text("")
