@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import torchrl_mpfa
-from torchrl_mpfa.lazy import GONE
 
 NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]
 
@@ -89,7 +88,6 @@ _NEED_ROS = ("ros.policy_node", "ros.robot_node")
 def documented(package, alias):
     """Dotted names of modules and what is in them, as the pages have them."""
     pages = {ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
-    pages -= {ROOT / "docs/from_0_4.md"}  # The page of names that are gone.
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     found = set(re.findall(rf"\b(?:{package}|{alias})\.([a-z_]+(?:\.\w+)*)(?=[`(\s])", text))
     files = {
@@ -139,31 +137,3 @@ def look(package, names):
 def test_an_unknown_name_is_an_attribute_error(package):
     code = f"import {package}\nassert not hasattr({package}, 'no_such_module')"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-PAGE = ROOT / "docs" / "from_0_4.md"
-LOSSES, LEARNERS, STORAGES = (f"torchrl_mpfa.{name}" for name in ("losses", "learners", "storages"))
-PACKAGES = {
-    "SignalStorageMixin": [STORAGES],
-    "SignalTable": [STORAGES],
-    "hydra": ["torchrl_mpfa.integrations"],
-    "SignalLoss": [LOSSES],
-    "MultiTensorSoftUpdate": [LEARNERS],
-    "ReplayHistory": ["torchrl_mpfa", "torchrl_mpfa.history"],
-    "make_value_table": ["torchrl_mpfa.networks"],
-    "check_adjustment": ["torchrl_mpfa.testing"],
-    "check_fusion": ["torchrl_mpfa.testing"],
-}
-"""Packages that a name was in, if that was not the first."""
-
-
-@pytest.mark.parametrize("name", GONE)
-def test_name_that_went_says_what_replaces_it(name):
-    further = LEARNERS if name.endswith("Learner") else LOSSES
-    for package in PACKAGES.get(name, ["torchrl_mpfa", further]):
-        with pytest.raises(
-            ImportError, match=f"{name} is no longer there since 0.5: use "
-        ) as error:
-            exec(f"from {package} import {name}", {})
-        assert GONE[name] in str(error.value)
-    assert name in PAGE.read_text(encoding="utf-8")

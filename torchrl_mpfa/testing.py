@@ -25,7 +25,6 @@ from torch import Tensor
 
 from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.fusion import checked_weights
-from torchrl_mpfa.lazy import find
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
@@ -71,11 +70,6 @@ def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int 
     _check_round_trip(buffer, _trained(make_sampler(), batch_size, seed=1))
     _check_rejections(buffer)
     _check_frequencies(buffer)
-
-
-def __getattr__(name: str) -> Any:
-    """Say of a name that went what replaces it."""
-    return find(__name__, name, {})
 
 
 def _trained(

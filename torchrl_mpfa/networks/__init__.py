@@ -36,5 +36,5 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Say of a name that went what replaces it."""
+    """Import a module when it is first used."""
     return find(__name__, name, {})
