@@ -12,12 +12,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl import objectives
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_mpfa.checks import as_mask
-from torchrl_mpfa.lazy import find
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 from torchrl_mpfa.storages.schema import as_path
@@ -224,9 +224,10 @@ def write_signals(
     r"""Write the signals of Eqs. (13)-(14) in a batch that one of TorchRL's losses was called with.
 
     The TD error is the largest of the critics, as TorchRL writes it. The slope is that of the first
-    critic in its evaluation mode, of quantiles that of their mean. The slope takes a forward and a
-    backward pass of its own: call this before the step of the optimizer, by which the critic would
-    be another one. Where the loss is compiled, call this outside of what is compiled.
+    critic in its evaluation mode, of quantiles that of their mean, of an agent that of its own
+    value. It takes a forward and a backward pass of its own, one for each agent: call this before
+    the step of the optimizer, by which the critic would be another one. Where the loss is compiled,
+    call this outside of what is compiled.
 
     Args:
         batch: Transitions, batch size ``[B]``, that ``loss(batch)`` was called with; gets
@@ -280,10 +281,23 @@ def write_signals(
     if hasattr(loss.tensor_keys, "state_action_value") and not isinstance(
         loss, objectives.DiscreteIQLLoss
     ):
-        value, action = _value_of_action(batch, loss)
-        # That of the sum: no transition enters another one's value.
-        (slope,) = torch.autograd.grad(value.sum(), action)
+        with torch.inference_mode(False):
+            slope = _slope(*_value_of_action(batch, loss), batch.ndim)
         batch.set(ACTION_GRADIENT.key, action_gradient_priority(slope, order=order))
+
+
+def _slope(value: Tensor, action: Tensor, lead: int) -> Tensor:
+    """Return the slope of each transition's value, and of each agent's own, as the actions."""
+    agents = action.shape[lead:-1].numel()
+    if agents == 1 or value.shape != action.shape[:-1]:
+        # That of the sum: no transition enters another one's value.
+        return torch.autograd.grad(value.sum(), action)[0]
+    # A critic may see the actions of all agents, whose values would cancel in a sum.
+    values, slope = value.flatten(lead), torch.empty_like(action)
+    for agent in range(agents):
+        (of_all,) = torch.autograd.grad(values[..., agent].sum(), action, retain_graph=True)
+        slope.flatten(lead, -2)[..., agent, :] = of_all.flatten(lead, -2)[..., agent, :]
+    return slope
 
 
 def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
@@ -293,14 +307,14 @@ def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
     """
     name = "value_network" if isinstance(loss, objectives.DDPGLoss) else "qvalue_network"
     critic, weights = getattr(loss, name), getattr(loss, f"{name}_params")
-    if name == "qvalue_network":
+    if name == "qvalue_network" and weights.batch_dims:  # A single critic is not stacked.
         weights = weights[0]
     keys = loss.tensor_keys
     # TorchRL's DDPG has no name for the action.
-    key = getattr(keys, "action", None)
-    if key is None:
-        key = next(key for key in critic.in_keys if as_path(key)[-1] == "action")
+    key = getattr(keys, "action", None) or _action_key(critic, loss.actor_network)
     inputs = batch.select(*critic.in_keys).detach()
+    if any(entry.is_inference() for entry in inputs.values(True, True)):
+        inputs = inputs.clone()  # Gradients need others.
     action = inputs[key].clone().requires_grad_()
     # Batch normalization counts, and dropout samples, in training alone.
     in_training = [module for module in critic.modules() if module.training]
@@ -312,6 +326,18 @@ def _value_of_action(batch: TensorDictBase, loss: Any) -> tuple[Tensor, Tensor]:
     return value.mean(-1) if value.ndim == action.ndim else value, action
 
 
-def __getattr__(name: str) -> Any:
-    """Say of a name that went what replaces it."""
-    return find(__name__, name, {})
+def _action_key(critic: Any, actor: Any) -> NestedKey:
+    """Return the entry that an actor writes and its critic reads, the action.
+
+    Raises:
+        KeyError: If there is none, or several and none is called ``"action"``.
+    """
+    read: list[NestedKey] = list(critic.in_keys)
+    shared = [key for key in read if key in actor.out_keys]
+    named = [key for key in shared or read if as_path(key)[-1] == "action"]
+    if len(named or shared) != 1:
+        raise KeyError(
+            f"the critic must read one action of the actor, got {shared} of what it reads, {read}: "
+            "name the action 'action', or write batch['signals', 'action_gradient'] yourself"
+        )
+    return (named or shared)[0]
