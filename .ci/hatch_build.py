@@ -23,8 +23,8 @@ class CompiledLoops(BuildHookInterface[Any]):
         folder = Path(self.root) / "torchrl_mpfa" / "native"
         build = runpy.run_path(str(folder / "build.py"))
         library = folder / build["library_name"]()
-        if not build["compile_library"](library):
-            self.app.display_warning("no C compiler: replay is compiled at its first use")
+        if (reason := build["compile_library"](library)) is not None:
+            self.app.display_warning(f"replay is compiled at its first use: {reason}")
             return
         self._library = library
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")

@@ -18,6 +18,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler, Sampler
 from torchrl.envs.transforms import Transform
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_generator
+from torchrl_mpfa.native import opaque
 from torchrl_mpfa.samplers.composition import distributions
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
@@ -136,7 +137,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             self._check_fusing_parts()
         super()._initialize_prioritized_sampler()
         if self._fuses and len(self._storage):
-            slots = torch.arange(len(self._storage))
+            slots = torch.arange(len(self._storage), device="cpu")
             self._sampler.mark_update(slots, storage=self._storage)
 
     def _check_fusing_parts(self) -> None:
@@ -170,23 +171,37 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         more = self._transform or self._sample_unit or self._pin_memory
         if more or self._writer.tracks_generations or not self._fuses:
             data, info = super()._sample(batch_size)
+            rest = info if self._fuses else {}
         else:
             with self._replay_lock, self._write_lock:
                 index, info = self._sampler.sample(self._storage, batch_size)
                 info["index"] = index
-                if isinstance(self._storage, SignalTensorStorage):
-                    data = self._storage.batch(index, info)
-                    if data is not None:
-                        return self._collate_fn(data), info
-                data = self._collate_fn(self._storage.get(index))
+                data, rest = self._rows_with(index, info)
+                data = self._collate_fn(data)
         # Written here, where the batch is made: afterwards TorchRL's buffer would move each
         # entry to the device that it is on already, at a tenth of the cost of the whole call.
-        if self._fuses:
+        if rest:
             with data.unlock_() if data.is_locked else nullcontext():
-                for key, value in info.items():
+                for key, value in rest.items():
                     data.set(key, torch.stack(value, -1) if isinstance(value, tuple) else value)
         return data, info
 
+    def _rows_with(self, index: Any, info: dict[Any, Any]) -> tuple[Any, dict[Any, Any]]:
+        """Return stored rows, with what the sampler says of them, and what is still to be set."""
+        if isinstance(self._storage, SignalTensorStorage) and isinstance(index, Tensor):
+            # Entries of the top that have a number for each row.
+            beside = {
+                key: value
+                for key, value in info.items()
+                if isinstance(key, str)
+                and isinstance(value, Tensor)
+                and value.shape[:1] == index.shape
+            }
+            if (data := self._storage.batch(index, beside)) is not None:
+                return data, {key: value for key, value in info.items() if key not in beside}
+        return self._storage.get(index), info
+
+    @opaque
     def sample(
         self,
         batch_size: int | None = None,
@@ -232,11 +247,15 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             stacklevel=3,
         )
 
+    @opaque
     def update_priority(self, index: Any, priority: Any) -> None:
         """Set priorities directly, as in TorchRL."""
-        super().update_priority(index, priority)
+        # TorchRL would move the numbers to the default device.
+        with torch.device(getattr(priority, "device", "cpu")):
+            super().update_priority(index, priority)
         self._unreturned = 0
 
+    @opaque
     def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """Update signals and priorities of a sampled batch.
 
@@ -380,6 +399,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 # No step that waits may join those of the state.
                 self._memory.empty()
                 self._transform.load_state_dict(state["_transforms"])
+                self._memory.check_finite()
                 load("sampler", sampler)
             except BaseException:
                 self._transform.load_state_dict(before[0])
@@ -393,6 +413,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 load("storage", self._storage)
                 self._check_loaded()
                 load("writer", self._writer)
+                self._record_cursor()
             except BaseException:
                 self.empty()
                 raise
@@ -400,10 +421,14 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             self._consume_after_n_samples = state.get("_consume_after_n_samples")
             if generator is not None:
                 self.set_rng(generator)
-            # TorchRL keeps no record of what was written last.
-            cursor = getattr(self._writer, "_cursor", None)
-            if cursor is not None and len(self._storage) and not self._is_consuming():
-                self._storage._set_last_cursor((cursor - 1) % self._storage._len_along_dim0)
+
+    def _record_cursor(self) -> None:
+        """Tell the storage what was written last, of which TorchRL keeps no record."""
+        storage, cursor = self._storage, getattr(self._writer, "_cursor", None)
+        if cursor is not None and len(storage) and not self._is_consuming():
+            # A list has no dimension but its own.
+            length = getattr(storage, "_len_along_dim0", None) or len(storage)
+            storage._set_last_cursor((cursor - 1) % length)
 
     def _check_loaded(self) -> None:
         """Reject loaded transitions that could not have been written."""

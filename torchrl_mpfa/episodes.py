@@ -62,7 +62,7 @@ def episodes_of(
         >>> episodes_of(steps, torch.arange(4), torch.zeros(4), none).tolist()
         [0, 1, 0, 1]
     """
-    count, place = len(places), torch.arange(len(places))
+    count, place = len(places), torch.arange(len(places), device="cpu")
     seen, label = [*_seen(steps)], number.double().view(torch.long).cpu()
     if loaded is not None and not seen:
         label = 2 * label + loaded
@@ -74,7 +74,7 @@ def episodes_of(
     # Of equal ones in their order, in which a step begins before it ends.
     order = torch.cat((2 * place, 2 * place + 1)).argsort()
     order = order[key[order].argsort(stable=True)]
-    at = torch.arange(2 * count)
+    at = torch.arange(2 * count, device="cpu")
     open_end = (order >= count) & ~last.cpu().repeat(2)[order]
     latest = torch.where(open_end, at, -1).cummax(0).values.clamp_min(0)
     joined = open_end[latest] & (key[order[latest]] == key[order]) & (order < count)
@@ -109,6 +109,7 @@ def _hash(rows: Tensor) -> Tensor:
     """Return a number for each row, on the CPU, which differs for different rows, shape ``[B]``."""
     # Adding zero makes one zero of the two that there are.
     bits = (rows.nan_to_num(nan=1e30).double() + 0.0).view(torch.long)
-    factor = torch.randint(2**62, (rows.shape[1],), generator=torch.Generator().manual_seed(0))
+    seeded = torch.Generator("cpu").manual_seed(0)
+    factor = torch.randint(2**62, (rows.shape[1],), generator=seeded, device="cpu")
     mixed = (bits ^ (bits >> 29)) * (2 * factor + 1).to(bits.device)
     return (mixed ^ (mixed >> 32)).sum(1).cpu()

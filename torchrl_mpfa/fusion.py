@@ -341,7 +341,8 @@ class FixedFusion(Fusion):
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return the fixed weights in the order of ``names``, shape ``[K]``."""
-        return torch.tensor([self.values.get(name, 0.0) for name in names], dtype=torch.double)
+        values = [self.values.get(name, 0.0) for name in names]
+        return torch.tensor(values, dtype=torch.double, device="cpu")
 
 
 @dataclass(frozen=True)
@@ -386,7 +387,7 @@ class ScaledFusion(Fusion):
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Return weights divided by the means of the signals, shape ``[K]``."""
         weights = self.fusion.weights(names, table, index)
-        places = torch.tensor([table.column[name] for name in names])
+        places = torch.tensor([table.column[name] for name in names], device="cpu")
         signals = table.rows[: table.size, places]
         mean = signals.nanmean(0).to(weights.dtype)
         # A signal that is zero everywhere, or known of no transition yet, has no scale.

@@ -69,7 +69,8 @@ class SharedWrites:
                 "the transitions of another process are not in shared memory: start it by 'spawn', "
                 f"not by 'fork'. {_RAY}"
             )
-        slots = torch.arange(end - min(new, len(storage)), end) % storage.max_size
+        slots = torch.arange(end - min(new, len(storage)), end, device="cpu")
+        slots %= storage.max_size
         sampler.mark_update(slots, storage=storage)
         sampler.extend(slots)
         buffer._clock[0] += 1

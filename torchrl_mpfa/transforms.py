@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from typing import Any
@@ -71,9 +71,7 @@ class TransformMemory:
         try:
             # A copy: the caller may write into its own again.
             rows = self._transform.inv(_with_masks(data.clone(), parts))
-            for _, _, value in _changes(before):
-                for waiting in _rows(value):
-                    check_finite_entries(waiting, waiting.ndim, self._allowed)
+            self.check_finite(value for _, _, value in _changes(before))
             yield rows
         except BaseException:
             self.set_back(copies)
@@ -83,6 +81,14 @@ class TransformMemory:
             raise
         for part, name, _ in _changes(before):
             self._first[part].setdefault(name, copies[part].get(name))
+
+    def check_finite(self, values: Iterable[Any] | None = None) -> None:
+        """Reject a number that is not finite in the steps that wait in these, by default all."""
+        if values is None:
+            values = (value for part in self.parts() for value in _attributes(part).values())
+        for value in values:
+            for waiting in _rows(value):
+                check_finite_entries(waiting, waiting.ndim, self._allowed)
 
     def set_back(self, copies: dict[nn.Module, _Attributes]) -> None:
         """Give modules the attributes that they had when these were copied."""

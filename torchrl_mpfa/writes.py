@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from multiprocessing.context import get_spawning_popen
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,6 +14,7 @@ from torchrl.data import RoundRobinWriter, TensorDictReplayBuffer, TensorDictRou
 from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 
 from torchrl_mpfa.checks import check_not_negative
+from torchrl_mpfa.native import opaque
 from torchrl_mpfa.samplers.compiled import write_compiled
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
@@ -22,6 +23,7 @@ from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
 
+_Buffer = TypeVar("_Buffer", bound="CheckedReplayBuffer")
 REWARD_KEY = ("next", "reward")
 """Where TorchRL's collectors put the reward."""
 
@@ -40,7 +42,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         super()._initialize_prioritized_sampler()
         self._memory = TransformMemory(self._transform, self._allow_nonfinite)
 
-    def share(self, shared: bool = True) -> Self:
+    def share(self: _Buffer, shared: bool = True) -> _Buffer:
         """Let other processes write, or no longer; signals and priorities stay in this one."""
         before = getattr(self, "_write_lock", None)
         super().share(shared)
@@ -72,6 +74,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         consumes = isinstance(sampler, ConsumingSampler)
         return has_signals and not consumes and isinstance(data, TensorDictBase)
 
+    @opaque
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
 
@@ -132,7 +135,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             if not write_compiled(sampler, storage._storage, data, start):
                 return None
             end = start + count
-            index = torch.arange(start, end)
+            index = torch.arange(start, end, device="cpu")
             index = index if end <= storage.max_size else index % storage.max_size
             writer._cursor = end % storage.max_size
             writer._write_count += count
@@ -160,7 +163,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         """Write transitions that the transforms made."""
         if data is None or data.shape.numel() == 0:
             shape = (0,) if self._storage.ndim == 1 else (0, self._storage.ndim)
-            return torch.zeros(shape, dtype=torch.long)
+            return torch.zeros(shape, dtype=torch.long, device="cpu")
         priority = data.get(self.priority_key, None)
         # A copy in both cases, as the writer adds the slots, which the caller's data shall not get.
         is_apart = priority is not None and isinstance(self._sampler, SignalSampler)
@@ -292,6 +295,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         index = self.extend(data.unsqueeze(self.dim_extend))
         return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
 
+    @opaque
     def __setitem__(self, index: Any, value: Any) -> None:
         """Write whole transitions in slots, and none of their entries by its key."""
         self._check_owned()

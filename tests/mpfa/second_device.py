@@ -123,5 +123,6 @@ def use_leaves(monkeypatch):
         made(self)
         self._sum_tree = SumLeaves(self._max_capacity)
         self._min_tree, self._max_tree = (MinLeaves(self._max_capacity) for _ in range(2))
+        self._apart = torch.full((self._max_capacity,), torch.nan, dtype=torch.double)
 
     monkeypatch.setattr(TreeSampler, "_init", init)

@@ -247,12 +247,18 @@ def test_waiting_steps_share_no_tensors_with_the_caller(kind):
     assert torch.equal(buffer[:]["observation"], other[:]["observation"])
 
 
-@pytest.mark.parametrize("wrong", [3, {"reward": torch.full((2,), torch.nan)}])
-def test_wrong_state_of_unfinished_episodes_is_rejected_and_changes_nothing(wrong):
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (3, "the saved unfinished episodes must be"),
+        ({"reward": torch.full((2,), torch.nan)}, "entry 'reward' must be finite, got nan"),
+    ],
+)
+def test_wrong_state_of_unfinished_episodes_is_rejected_and_changes_nothing(wrong, words):
     buffer = make("hindsight")
     buffer.extend(steps(0, 4))
     state = snapshot(buffer)
     (name,) = [name for name in state["_transforms"] if name.endswith("_extra_state")]
     state["_transforms"][name] = wrong
-    with rejected(buffer, ValueError, "the saved unfinished episodes must be"):
+    with rejected(buffer, ValueError, words):
         buffer.load_state_dict(state)

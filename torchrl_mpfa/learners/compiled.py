@@ -9,12 +9,16 @@ loss are inputs of it: a learner of the same settings as one before it is only r
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from itertools import islice
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
 import torch
@@ -28,6 +32,7 @@ from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from torchrl_mpfa.caches import own_cache_folder
 from torchrl_mpfa.learners.adam import FlatAdam, FlatGroup
 from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import SIGNALS_KEY
@@ -284,22 +289,25 @@ def _keep_programs() -> None:
     # PyTorch writes that default into the environment itself.
     if os.environ.get("TORCHINDUCTOR_CACHE_DIR") not in (None, default_cache_dir()):
         return
-    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     # Processors of several kinds may share the folder.
     able = sorted(name for name, has in torch.cpu.get_capabilities().items() if has is True)
     processor = hashlib.sha256(repr(able).encode()).hexdigest()[:16]
-    folder = Path(cache, "torchrl_mpfa", "programs", processor)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # There is no home to write to: the temporary folder is what is left.
-        return
-    try:
-        folder.chmod(0o700)
-    except OSError as error:
-        raise PermissionError(
-            f"{folder} must be a folder of your own: set XDG_CACHE_HOME or TORCHINDUCTOR_CACHE_DIR"
-        ) from error
+    if (folder := own_cache_folder("programs", processor)) is None:
+        folder = _folder_of_this_process()
     os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder)
+
+
+@cache
+def _folder_of_this_process() -> Path:
+    """Make a folder for programs that is removed when the process ends."""
+    warnings.warn(
+        "programs are compiled at every start, as there is no folder of caches that is yours and "
+        "that only you can write to: set XDG_CACHE_HOME or TORCHINDUCTOR_CACHE_DIR",
+        stacklevel=2,
+    )
+    folder = mkdtemp(prefix="torchrl_mpfa-")
+    atexit.register(rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _leaves(batch: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[NestedKey, Tensor]]:

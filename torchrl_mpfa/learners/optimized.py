@@ -235,13 +235,33 @@ class OptimizedLearner:
         self._flatten()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, targets, optimizer and count, as tensors and plain values."""
+        """Return networks, targets, optimizer and count, as tensors and plain values.
+
+        Raises:
+            ValueError: If a parameter is not finite, as no learner would load it.
+        """
+        state = self._state()
+        self._check_numbers(state)
+        return state
+
+    def _state(self) -> dict[str, Any]:
         return {
             "networks": self.networks.state_dict(),
             "targets": self.targets.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "updates": self.updates,
         }
+
+    def _check_numbers(self, state: Mapping[str, Any]) -> None:
+        """Reject a state with what is trained, or its moments, not finite.
+
+        Other tensors may be so by design: a causal mask, or a least value that begins at infinity.
+        """
+        trained = {name for name, p in self.networks.named_parameters() if p.requires_grad}
+        for part in ("networks", "targets"):
+            numbers = {name: value for name, value in state[part].items() if name in trained}
+            check_saved_numbers("learner", numbers)
+        check_saved_numbers("learner", state["optimizer"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state from :meth:`state_dict`.
@@ -252,10 +272,6 @@ class OptimizedLearner:
         Raises:
             ValueError: If it is of another kind or size, or not finite; nothing is changed then.
         """
-        if isinstance(state_dict, Mapping) and "loss" in state_dict:
-            raise ValueError(
-                "the saved learner is of version 0.4, which is not read: finish its run with 0.4"
-            )
         # A twin takes a step, so that it has all moments: PyTorch does not check their sizes, and
         # its fused optimizers write past the end.
         twin = copy.deepcopy(self.optimizer)
@@ -263,7 +279,9 @@ class OptimizedLearner:
             for parameter in group["params"]:
                 parameter.grad = torch.zeros_like(parameter)
         twin.step()
-        check_alike("learner", state_dict, {**self.state_dict(), "optimizer": twin.state_dict()})
+        like = {**self._state(), "optimizer": twin.state_dict()}
+        check_form("the saved learner", state_dict, like)
+        self._check_numbers(state_dict)
         self.networks.load_state_dict(state_dict["networks"])
         self.targets.load_state_dict(state_dict["targets"])
         # PyTorch would share the tensors with the owner of the state.
@@ -328,13 +346,8 @@ def _first_not_finite(batch: TensorDictBase) -> str | None:
     return None
 
 
-def check_alike(part: str, state: Any, like: Any) -> None:
-    """Raise unless a saved state has entries, types and sizes like another, all finite."""
-    _check_form(f"the saved {part}", state, like)
-    check_saved_numbers(part, state)
-
-
-def _check_form(place: str, state: Any, like: Any) -> None:
+def check_form(place: str, state: Any, like: Any) -> None:
+    """Raise unless a saved state has entries, types and sizes like another."""
     if isinstance(like, Tensor) and isinstance(state, Tensor):
         # PyTorch keeps a count in the default type of the process that began.
         if state.shape != like.shape or (state.dtype is not like.dtype and like.ndim):
@@ -346,10 +359,10 @@ def _check_form(place: str, state: Any, like: Any) -> None:
             word = "lacks" if missing else "must not have"
             raise ValueError(f"{place} {word} {unfit[0]!r}")
         for key, value in state.items():
-            _check_form(f"{place}, {key!r}", value, like[key])
+            check_form(f"{place}, {key!r}", value, like[key])
     elif isinstance(like, list) and isinstance(state, list) and len(like) == len(state):
         for number, pair in enumerate(zip(state, like, strict=True)):
-            _check_form(f"{place}, {number}", *pair)
+            check_form(f"{place}, {number}", *pair)
     elif type(state) is not type(like) or isinstance(like, list):
         raise ValueError(f"{place} must be {_form(like)}, got {_form(state)}")
 

@@ -15,7 +15,7 @@ from torchrl.envs import Transform
 
 from torchrl_mpfa.checks import as_mask, check_counts
 from torchrl_mpfa.episodes import episodes_of
-from torchrl_mpfa.saving import check_saved, check_saved_numbers
+from torchrl_mpfa.saving import check_saved
 
 
 class Relabel(Protocol):
@@ -54,7 +54,7 @@ def future_goals(length: int, goals: int, generator: torch.Generator | None = No
         >>> future_goals(3, 4).sort().values
         tensor([0, 1, 2])
     """
-    return torch.randperm(length, generator=generator)[:goals]
+    return torch.randperm(length, generator=generator, device="cpu")[:goals]
 
 
 class HindsightGoals(Transform):
@@ -131,11 +131,12 @@ class HindsightGoals(Transform):
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restore the steps of unfinished episodes.
 
+        Numbers that are not finite are rejected by the buffer, which knows where they may be.
+
         Raises:
-            ValueError: If the state is no mapping, or a number is not finite.
+            ValueError: If the state is no mapping.
         """
         check_saved("unfinished episodes", state)
-        check_saved_numbers("unfinished episodes", state)
         steps = {key: value.clone() for key, value in state.items()}
         count = len(next(iter(steps.values()))) if steps else 0
         self._pending = (TensorDict(steps, [count]),) if steps else ()
@@ -165,7 +166,7 @@ class HindsightGoals(Transform):
         )
         done = done.bool()
         mine = torch.isin(number, number[done]).nonzero().squeeze(1)
-        episode = torch.full((len(rows),), -1)
+        episode = torch.full((len(rows),), -1, device="cpu")
         episode[mine] = episodes_of(rows, mine, number[mine], done[mine])
         ended = episode[done]
         self._pending = (rows[~torch.isin(episode, ended)],)

@@ -118,7 +118,7 @@ class ReaPERSampler(SignalSampler):
         # Numbers of the episodes that no two share, as those that are written may begin again.
         self._episodes = torch.zeros(self._max_capacity, dtype=torch.long, device=self.device)
         self._last_number = self._numbered = 0
-        self._open = torch.empty(0, dtype=torch.long)
+        self._open = torch.empty(0, dtype=torch.long, device="cpu")
 
     def check_new(self, data: Any, count: int) -> Tensor:
         """See :meth:`SignalSampler.check_new`; the mark of an end must be a boolean."""
@@ -176,13 +176,15 @@ class ReaPERSampler(SignalSampler):
         loaded, data = time[slots] < table.loaded, self._steps._storage
         first = episodes_of(data, slots, number, last > 0, loaded, ndim=self._steps.ndim)
         is_new = time[slots] >= self._numbered
-        new_ids = self._last_number + ((first == torch.arange(len(first))) & is_new).cumsum(0)
+        new_ids = self._last_number + (
+            (first == torch.arange(len(first), device="cpu")) & is_new
+        ).cumsum(0)
         ids = torch.where(is_new, new_ids, self._episodes[slots].cpu())[first]
         self._last_number = int(new_ids[-1])
         self._episodes[slots] = ids.to(self.device)
         # The last step of each is the one that is written last.
-        last_step = torch.zeros(self._last_number + 1, dtype=torch.long)
-        last_step[ids] = torch.arange(len(ids))
+        last_step = torch.zeros(self._last_number + 1, dtype=torch.long, device="cpu")
+        last_step[ids] = torch.arange(len(ids), device="cpu")
         last_step = last_step[ids.unique()].sort().values
         self._open = slots[last_step[~(last[last_step] > 0)]][-_UNDER_WAY:]
         self._numbered = table.writes

@@ -9,12 +9,19 @@ from __future__ import annotations
 
 import ctypes
 import os
+import warnings
+from collections.abc import Callable
 from ctypes import Structure, c_double, c_int64, c_void_p
 from functools import cache
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.caches import is_own, own_cache_folder
 from torchrl_mpfa.native.build import SOURCE, compile_library, library_name
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class Replay(Structure):
@@ -55,29 +62,75 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
 }
 
 
+def opaque(function: _Function) -> _Function:
+    """Keep ``torch.compile`` out of a function that calls C.
+
+    What is traced gives up a tensor after its last use, and C would read freed memory.
+    """
+    return cast(_Function, torch.compiler.disable(function))
+
+
+def is_plain(values: Tensor) -> bool:
+    """Return True if the memory of a tensor is its numbers, side by side, on the CPU."""
+    return (
+        values.is_cpu
+        and values.layout is torch.strided
+        and values.is_contiguous()
+        and not (values.is_neg() or values.is_conj())
+    )
+
+
+def address(values: Tensor, dtype: torch.dtype) -> int:
+    """Return the address of numbers of a type; they must live until C returns.
+
+    Raises:
+        TypeError: If the tensor is not plain, or of another type.
+    """
+    if values.dtype is not dtype or not is_plain(values):
+        raise TypeError(
+            f"values must be a plain tensor of {dtype} on the CPU, got {values.dtype} on "
+            f"{values.device}"
+        )
+    return values.data_ptr()
+
+
 @cache
 def find_loops() -> Any:
-    """Return the compiled loops; None where there are none."""
+    """Return the compiled loops; None, with a warning that says why, where there are none."""
     if os.environ.get("TORCHRL_MPFA_NATIVE") == "0":
         return None
-    compiled = _load(SOURCE.with_name(library_name()))
-    if compiled is None and (folder := _own_folder()) is not None:
-        path = folder / library_name()
-        compiled = _load(path)
-        if compiled is None and compile_library(path):
-            compiled = _load(path)
+    try:
+        if (compiled := _load(SOURCE.with_name(library_name()))) is not None:
+            return compiled
+        compiled, reason = _of_user()
+    except Exception as error:  # PyTorch is there, whatever a machine lacks.
+        compiled, reason = None, f"{type(error).__name__}: {error}"
+    if compiled is None:
+        warnings.warn(
+            f"no compiled loops of replay, which then takes several times as long: {reason}. With "
+            "TORCHRL_MPFA_NATIVE=0 in the environment PyTorch does it without this warning",
+            stacklevel=2,
+        )
     return compiled
 
 
-def _own_folder() -> Path | None:
-    """Return the user's folder of caches; None if there is none that only the user can write to."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchrl_mpfa"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        folder.chmod(0o700)  # What lies there is executed.
-    except OSError:
-        return None
-    return folder
+def _of_user() -> tuple[Any, str]:
+    """Return the loops in the user's folder of caches, compiled once; or None, and why."""
+    if (folder := own_cache_folder()) is None:
+        return None, "there is no folder of caches that is yours and that only you can write to"
+    path = folder / library_name()
+    failed = path.with_suffix(".failed")
+    if is_own(path) and (compiled := _load(path)) is not None:
+        return compiled, ""
+    if failed.exists():
+        return None, f"{path} could not be loaded: remove {failed} to compile it again"
+    if (reason := compile_library(path)) is not None:
+        return None, reason
+    if (compiled := _load(path)) is None:
+        # Else every start would compile again.
+        failed.touch()
+        return None, f"{path} cannot be loaded, as on a disk without the right to execute"
+    return compiled, ""
 
 
 def loops() -> Any:
@@ -94,7 +147,7 @@ def loops() -> Any:
     return compiled
 
 
-def _load(path: Path) -> Any:
+def _load(path: os.PathLike[str]) -> Any:
     """Return the loops of a file; None if there is none, or one of another kind of machine."""
     try:
         compiled = ctypes.CDLL(str(path))

@@ -128,6 +128,7 @@ int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64
   if (outside(slots, n, end)) return 1;
   for (int64_t c = 0; c < count; c++) {
     int64_t b = columns[c].bytes;
+    if (b == 0) continue;
     const char *from = columns[c].stored;
     char *to = columns[c].rows;
     // A copy whose size the compiler knows takes one instruction.
@@ -147,7 +148,7 @@ int64_t scatter(const Column *columns, int64_t count, const int64_t *slots, int6
   if (outside(slots, n, end)) return 1;
   for (int64_t c = 0; c < count; c++) {
     int64_t b = columns[c].bytes;
-    for (int64_t i = 0; i < n; i++) memcpy(columns[c].stored + slots[i] * b, columns[c].rows + i * b, b);
+    for (int64_t i = 0; b && i < n; i++) memcpy(columns[c].stored + slots[i] * b, columns[c].rows + i * b, b);
   }
   return 0;
 }
@@ -274,7 +275,10 @@ int64_t update(const Replay *r, Fusion *f, const int64_t *slots, int64_t n, int6
     *leaf_of(r, slots[i]) = (Node){leaf, leaf, -priority[i], priority[i]};
   }
   lift(r, slots, n);
-  f->highest = priority[top];
+  // Of a slot that is named twice the last entry counts.
+  for (int64_t i = top = 0; i < n; i++)
+    if (leaf_of(r, slots[i])->priority > leaf_of(r, slots[top])->priority) top = i;
+  f->highest = leaf_of(r, slots[top])->priority;
   f->slot = slots[top];
   wrong = 0;
 end:

@@ -17,7 +17,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay, above_mean, factors_by_place
-from torchrl_mpfa.native import Fusion, Replay, loops
+from torchrl_mpfa.native import Fusion, Replay, address, is_plain, loops, opaque
+from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.samplers.trees import CompiledTree
 from torchrl_mpfa.samplers.weighing import Weighing, weigh
 from torchrl_mpfa.signals import REWARD
@@ -40,14 +41,17 @@ _KINDS: list[tuple[type, ...]] = [
 _STEPS = (
     *("mark_update", "_record", "check_new", "_sampled", "_sample_slots", "_proportional"),
     *("_fused", "combined", "_checked", "_set", "_write", "_write_leaves", "_leaf"),
+    "_empty_table",
 )
 """Steps that compiled loops know as they are in ``SignalSampler``."""
 
 
 def is_compiled(sampler: SignalSampler, kind: type[SignalSampler]) -> bool:
     """Return True if compiled loops write, sample and update for a sampler of this kind."""
+    own, of_class = vars(sampler), type(sampler)
     return (
-        all(getattr(type(sampler), step) is getattr(kind, step) for step in _STEPS)
+        all(s not in own and getattr(of_class, s) is getattr(kind, s) for s in _STEPS)
+        and type(sampler.table) is SignalTable
         and sampler.dtype is torch.float
         and isinstance(sampler._sum_tree, CompiledTree)
         and tuple(map(type, sampler.adjustments)) in _KINDS
@@ -59,9 +63,10 @@ def is_compiled(sampler: SignalSampler, kind: type[SignalSampler]) -> bool:
 def _replay(sampler: SignalSampler) -> Replay:
     tree, rows = sampler._sum_tree, sampler.table.rows
     sizes = tree.size, tree.blocks, rows.shape[1]
-    return Replay(tree.nodes.data_ptr(), rows.data_ptr(), *sizes)
+    return Replay(address(tree.nodes, torch.double), address(rows, torch.double), *sizes)
 
 
+@opaque
 def sample_compiled(
     sampler: SignalSampler, size: int, shares: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -78,18 +83,19 @@ def sample_compiled(
     wrong = loops().sample(
         addressof(replay),
         min(size, sampler.table.capacity),
-        shares.data_ptr(),
+        address(shares, torch.double),
         shares.numel(),
         sampler._beta,
-        slots.data_ptr(),
-        weight.data_ptr(),
-        written.data_ptr(),
+        address(slots, torch.long),
+        address(weight, torch.float),
+        address(written, torch.double),
     )
     if wrong:
         sampler.check_positive(size)
     return slots, weight, written
 
 
+@opaque
 def update_compiled(
     sampler: SignalSampler,
     slots: Tensor,
@@ -117,8 +123,8 @@ def update_compiled(
     else:
         return None
     slots, replay = slots.contiguous(), _replay(sampler)
-    batch = slots.data_ptr(), count
-    written = None if written_at is None else written_at.data_ptr()
+    batch = address(slots, torch.long), count
+    written = None if written_at is None else address(written_at, torch.double)
     if loops().stale(addressof(replay), min(filled, table.capacity), *batch, written):
         return None
     first = slots if batches == 1 else slots[: count // batches]
@@ -133,7 +139,7 @@ def update_compiled(
             decay = _decay(count // batches, adjust.sharpness)
     weights = weighing.weights.contiguous()
     fusion = Fusion(
-        weights.data_ptr(),
+        address(weights, torch.double),
         weights.numel(),
         len(values),
         sampler._eps,
@@ -142,9 +148,9 @@ def update_compiled(
         bound,
         boost,
         _MARGIN,
-        None if decay is None else decay.data_ptr(),
+        None if decay is None else address(decay, torch.double),
     )
-    addresses = array("q", [value.data_ptr() for value in values])
+    addresses = array("q", [address(value, torch.float) for value in values])
     if loops().update(
         addressof(replay), addressof(fusion), *batch, batches, addresses.buffer_info()[0]
     ):
@@ -152,6 +158,7 @@ def update_compiled(
     return weighing, fusion.highest, fusion.slot
 
 
+@opaque
 def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start: int) -> bool:
     """Write new transitions from a slot on, with their signals and the highest priority.
 
@@ -179,15 +186,15 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
         return False
     priority, replay = float(sampler._fresh_priority()), _replay(sampler)
     array_of_columns = array("q", columns)
-    address = array_of_columns.buffer_info()[0]
+    first = array_of_columns.buffer_info()[0]
     if loops().write_new(
         addressof(replay),
-        address,
+        first,
         len(columns) // WIDTH,
         start,
         count,
-        address + 8 * WIDTH * place,
-        index.data_ptr(),
+        first + 8 * WIDTH * place,
+        address(index, torch.long),
         table.column.get(REWARD.name, -1),
         table.writes,
         priority,
@@ -201,8 +208,9 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
 
 
 def _fits(value: Tensor, dtype: torch.dtype, count: int) -> bool:
-    """Return True if a tensor on the CPU has so many numbers of a type."""
-    return value.is_cpu and value.dtype is dtype and value.numel() == count
+    """Return True if a tensor, once it is contiguous, has so many numbers of a type for C."""
+    fits = value.dtype is dtype and value.numel() == count and value.layout is torch.strided
+    return fits and is_plain(value.contiguous())
 
 
 @cache

@@ -41,7 +41,7 @@ def composition(
     signals = signals[~signals.isnan().any(1)]
     if weights and len(signals):
         # Shares in the mean priority of Eq. (21); equal ones if every signal is zero.
-        ordered = torch.tensor([weights[name] for name in names], dtype=torch.double)
+        ordered = torch.tensor([weights[n] for n in names], dtype=torch.double, device="cpu")
         parts = signals.mean(0) * ordered.to(signals.device)
         shares = parts / parts.sum() if parts.sum() > 0 else torch.full_like(parts, 1 / len(parts))
         numbers |= {f"share/{n}": v for n, v in zip(names, shares.tolist(), strict=True)}

@@ -88,7 +88,7 @@ class SignalSampler(TreeSampler):
     """
 
     KIND = "signals"
-    _compiled: bool | None = None
+    _weighing: Weighing | None
     KEPT: tuple[Signal, ...] = ()
     """Further entries of transitions that the table keeps."""
 
@@ -113,23 +113,14 @@ class SignalSampler(TreeSampler):
         agents: Agents | None = None,
     ) -> None:
         # The reward is where the transitions have it.
-        self.signals = tuple(
+        self._signals = tuple(
             replace(signal, key=reward_key) if signal == REWARD else signal
             for signal in as_signals(signals)
         )
-        fused = [signal.name for signal in self.signals]
-        self.fusion = FixedFusion(dict.fromkeys(fused, 1.0)) if fusion is None else fusion
-        if not isinstance(self.fusion, Fusion):
-            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {kind_of(fusion)}")
-        for name in self.fusion.signal_names:
-            if name not in fused:
-                raise ValueError(unknown("signal of the fusion", name, fused))
-        listed = isinstance(adjustments, Sequence)
-        if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
-            kinds = ", ".join(map(kind_of, adjustments)) if listed else kind_of(adjustments)
-            raise TypeError(f"adjustments must be a list of torchrl_mpfa.Adjustment, got {kinds}")
-        self.adjustments = tuple(adjustments)
-        self.positive_above: Level = check(LEVEL, positive_above=positive_above)
+        equal = FixedFusion(dict.fromkeys((signal.name for signal in self._signals), 1.0))
+        self.fusion = equal if fusion is None else fusion
+        self.adjustments = adjustments
+        self._positive_above: Level = check(LEVEL, positive_above=positive_above)
         if self.positive_above == "mean" and self.fusion.uses_level:
             warnings.warn(
                 "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
@@ -138,10 +129,9 @@ class SignalSampler(TreeSampler):
                 stacklevel=2,
             )
         self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
-        self._counting = [adjust.counts for adjust in self.adjustments]
         if agents not in (None, *get_args(Agents)):
             raise ValueError(f"agents must be 'max', 'mean' or None, got {agents!r}")
-        self.reward_key, self.agents = reward_key, agents
+        self._reward_key, self._agents = reward_key, agents
         self._warned: set[str] = set()
         self._next_rows: Tensor | None = None
         self._attached = False
@@ -160,28 +150,79 @@ class SignalSampler(TreeSampler):
         """Signals, reward, replay count and time of writing of every slot."""
         self._names = self.table.names[self.table.fused]
 
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that are fused, which the table of signals is made for."""
+        return self._signals
+
+    @property
+    def fusion(self) -> Fusion:
+        """How signals become one priority; another one counts its weights at the next update."""
+        return self._fusion
+
+    @fusion.setter
+    def fusion(self, fusion: Fusion) -> None:
+        if not isinstance(fusion, Fusion):
+            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {kind_of(fusion)}")
+        fused = [signal.name for signal in self._signals]
+        for name in fusion.signal_names:
+            if name not in fused:
+                raise ValueError(unknown("signal of the fusion", name, fused))
+        self._fusion, self._weighing = fusion, None
+
+    @property
+    def adjustments(self) -> Sequence[Adjustment]:
+        """Changes of fused priorities, in order; others count the buffer at the next update."""
+        return self._adjustments
+
+    @adjustments.setter
+    def adjustments(self, adjustments: Sequence[Adjustment]) -> None:
+        listed = isinstance(adjustments, Sequence)
+        if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
+            kinds = ", ".join(map(kind_of, adjustments)) if listed else kind_of(adjustments)
+            raise TypeError(f"adjustments must be a list of torchrl_mpfa.Adjustment, got {kinds}")
+        self._adjustments, self._weighing = tuple(adjustments), None
+        self._counting = [adjust.counts for adjust in adjustments]
+
+    @property
+    def reward_key(self) -> NestedKey:
+        """Where the signed reward of a transition is read."""
+        return self._reward_key
+
+    @property
+    def agents(self) -> Agents | None:
+        """Number of a transition where there is one for each agent."""
+        return self._agents
+
+    @property
+    def positive_above(self) -> Level:
+        """Reward above which a transition is positive."""
+        return self._positive_above
+
+    @positive_above.setter
+    def positive_above(self, level: Level) -> None:
+        self._positive_above = self.table.positive_above = check(LEVEL, positive_above=level)
+        self._weighing = None
+
     def _empty_table(self) -> SignalTable:
         return SignalTable(
             self._max_capacity,
             self.signals,
             kept=[signal for signal in self.KEPT if signal not in self.signals],
-            reward_key=self.reward_key,
-            positive_above=self.positive_above,
-            agents=self.agents,
+            reward_key=self._reward_key,
+            positive_above=self._positive_above,
+            agents=self._agents,
             device=self.device,
         )
 
     @property
     def compiled(self) -> bool:
         """True if compiled loops write, sample and update; else PyTorch does."""
-        if self._compiled is None:
-            self._compiled = is_compiled(self, SignalSampler)
-        return self._compiled
+        return is_compiled(self, SignalSampler)
 
     def _init(self) -> None:
         super()._init()
-        self._compiled = None
-        self._weighing: Weighing | None = None
+        self._weighing = None
         self._last_batch: tuple[Tensor, Tensor] | None = None
 
     @property
@@ -228,7 +269,7 @@ class SignalSampler(TreeSampler):
         rows = self.table.read(data, count)
         if (name := self.table.missing(rows)) is not None:
             keys = {signal.name: signal.key for signal in self.table.written}
-            key = keys.get(name, self.reward_key)
+            key = keys.get(name, self._reward_key)
             raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
         return rows
 
@@ -264,6 +305,7 @@ class SignalSampler(TreeSampler):
         """
         if self.compiled:
             size = self._filled(storage, batch_size)
+            self.check_positive(size)  # Before random numbers are taken.
             slots, weight, written_at = sample_compiled(self, size, self._mass(batch_size))
         else:
             slots, weight = self._sampled(storage, batch_size)
@@ -280,16 +322,17 @@ class SignalSampler(TreeSampler):
         # TorchRL's buffers hand a first priority to transitions that they find in a storage.
         if not self._attached and self._highest is not None:
             self.warn_once(
+                "one number",
                 f"{type(self).__name__} was given one number as the priority: it is neither fused "
                 "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. Use "
-                "SignalReplayBuffer"
+                "SignalReplayBuffer",
             )
         super().update_priority(index, priority, storage=storage)
 
-    def warn_once(self, text: str) -> None:
-        """Warn of something that this sampler has not yet warned of."""
-        if text not in self._warned:
-            self._warned.add(text)
+    def warn_once(self, subject: str, text: str) -> None:
+        """Warn of a subject that this sampler has not yet warned of."""
+        if subject not in self._warned:
+            self._warned.add(subject)
             warnings.warn(text, UserWarning, stacklevel=3)
 
     def update_signals(

@@ -114,7 +114,7 @@ class TreeSampler(SavedTrees):
         # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
         # over the negated priorities has it at its root. It leaves out fresh transitions: they
         # would hand on the highest priority that they were given, and one outlier would stay.
-        trees, self._priorities = make_trees(self._max_capacity, self.device)
+        trees, self._apart = make_trees(self._max_capacity, self.device)
         self._sum_tree, self._min_tree, self._max_tree = trees
         self._highest: float | None = None
         self._highest_slot: int | None = None
@@ -125,6 +125,16 @@ class TreeSampler(SavedTrees):
     def device(self) -> torch.device:
         """Device of priorities and sampled slots."""
         return self._device or torch.device("cpu")
+
+    @property
+    def _priorities(self) -> Tensor:
+        """Priorities, eps included and before alpha, NaN where nothing was written, ``[N]``."""
+        # Beside compiled trees they are in one tensor, of which a pickle would copy a view apart.
+        return self._sum_tree.priorities if self._apart is None else self._apart
+
+    @_priorities.setter
+    def _priorities(self, value: Tensor) -> None:
+        self._priorities.copy_(value)
 
     def _maybe_init_from_storage(self, storage: Storage | None) -> None:
         """Take the capacity of a storage and move to its device, once they are known."""
@@ -141,6 +151,7 @@ class TreeSampler(SavedTrees):
         state, self._device = self.state_dict(), device
         self.load_state_dict(state)
 
+    @torch.inference_mode(False)
     def _resize(self, capacity: int) -> None:
         """Begin with empty trees of another capacity."""
         self._max_capacity = capacity
@@ -371,7 +382,7 @@ class TreeSampler(SavedTrees):
         """
         self._maybe_init_from_storage(storage)
         slots = as_slots(index, storage).to(self.device)
-        value = torch.as_tensor(priority, device=self.device).detach()
+        value = torch.as_tensor(priority, device=self.device).detach().resolve_neg()
         if value.numel() not in (1, slots.numel()):
             raise RuntimeError(
                 "priority should be a number or an iterable of the same length as index. Got "
@@ -405,7 +416,7 @@ class TreeSampler(SavedTrees):
         transitions that they find in a storage, and for batches without a priority.
         """
         fresh = leaves_of(self._max_tree, slots) > 0
-        return fresh & (value.float() == torch.tensor(self.default_priority).float())
+        return fresh & (value.float() == torch.tensor(self.default_priority, device="cpu").float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
         """Return the highest of priorities, eps included; reject those that poison a tree."""
@@ -421,7 +432,8 @@ class TreeSampler(SavedTrees):
         """Write priorities that an update gave, eps included, of which this is the highest."""
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
-            self.keep_highest(highest, int(slots[priority.argmax()]))
+            stored = self._priorities[slots]  # Of a slot that is named twice the last one.
+            self.keep_highest(float(stored.max()), int(slots[stored.argmax()]))
 
     def keep_highest(self, highest: float, slot: int) -> None:
         """Keep a priority and its slot if none was as high so far."""

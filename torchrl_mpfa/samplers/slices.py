@@ -114,9 +114,9 @@ class SignalSliceSampler(SignalSampler):
             raise ValueError(f"device must be that of a storage on the CPU, got {self.device}")
         super()._init()
         # True if the step one stride after a slot is the next of its trajectory.
-        self._joined = torch.zeros(self._max_capacity, dtype=torch.bool)
+        self._joined = torch.zeros(self._max_capacity, dtype=torch.bool, device="cpu")
         self._stride = 1
-        self._lengths = torch.empty(0, dtype=torch.long)
+        self._lengths = torch.empty(0, dtype=torch.long, device="cpu")
 
     def check_new(self, data: Any, count: int) -> Tensor:
         """See :meth:`SignalSampler.check_new`; ends and numbers of trajectories must be there."""
@@ -164,7 +164,7 @@ class SignalSliceSampler(SignalSampler):
         index, info = super().sample(storage, batch_size)
         if self.truncated_key is None:
             return index, info
-        last = torch.zeros(int(self._lengths.sum()), 1, dtype=torch.bool)
+        last = torch.zeros(int(self._lengths.sum()), 1, dtype=torch.bool, device="cpu")
         last[self._lengths.cumsum(0) - 1] = True
         done = _column(storage, self._done_key, as_slots(index, storage), default=last).bool()
         return index, {**info, self.truncated_key: last, self._done_key: last | done}
@@ -220,24 +220,24 @@ class SignalSliceSampler(SignalSampler):
         joined = times[following] - times[slots] == self._stride
         joined &= ~_column(storage, self.end_key, slots).bool().squeeze(1)
         key = _TRAJ_IDS if self.traj_key is None else self.traj_key
-        one = torch.zeros(len(slots), 1, dtype=torch.bool)
+        one = torch.zeros(len(slots), 1, dtype=torch.bool, device="cpu")
         ids = [_column(storage, key, places, default=one) for places in (slots, following)]
         joined &= (ids[0] == ids[1]).squeeze(1) & follows(storage, table, slots, following)
         self._joined[slots] = joined
 
     def _windows(self, starts: Tensor, joined: Tensor, stride: int) -> tuple[Tensor, Tensor]:
         """Return the slots of slices and the mask of one trajectory, both ``[S, L]``."""
-        slots = starts.unsqueeze(1) + stride * torch.arange(self.slice_len)
+        slots = starts.unsqueeze(1) + stride * torch.arange(self.slice_len, device="cpu")
         slots %= self._max_capacity
-        inside = torch.ones(slots.shape, dtype=torch.bool)
+        inside = torch.ones(slots.shape, dtype=torch.bool, device="cpu")
         inside[:, 1:] = joined[slots[:, :-1]].cumprod(1).bool()
         return slots, inside
 
     def _starts_around(self, slots: Tensor) -> Tensor:
         """Return the starts of all slices that can hold these slots, shape ``[S]``."""
         if len(slots) * self.slice_len >= self._max_capacity:
-            return torch.arange(self._max_capacity)
-        starts = slots.unsqueeze(1) - self._stride * torch.arange(self.slice_len)
+            return torch.arange(self._max_capacity, device="cpu")
+        starts = slots.unsqueeze(1) - self._stride * torch.arange(self.slice_len, device="cpu")
         return (starts % self._max_capacity).unique()
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:

@@ -16,7 +16,6 @@ from torchrl_mpfa.samplers.trees import leaves_of, set_leaves
 from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
 
 FORMAT = 4
-_FORMAT_OF_0_4 = 3
 """Version of saved states."""
 
 
@@ -40,6 +39,7 @@ class SavedSampler:
         }
         return {"_format": FORMAT, "_kind": self.KIND, **copies}
 
+    @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state of a sampler of the same kind and size, on any device.
 
@@ -48,11 +48,6 @@ class SavedSampler:
             ValueError: If format, kind or a size differs, or a number is not finite; nothing is
                 changed.
         """
-        if isinstance(state_dict, dict) and state_dict.get("_format") == _FORMAT_OF_0_4:
-            raise ValueError(
-                "'_format' of the saved sampler must be 4, got 3: version 0.4 saved it: load it "
-                "with 0.4, whose signals lay in the storage"
-            )
         check_saved("sampler", state_dict, self.SAVED, _format=FORMAT, _kind=self.KIND)
         twin = object.__new__(type(self))
         vars(twin).update(vars(self))
@@ -83,7 +78,7 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
 
     KIND = "proportional"
     SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest", "_highest_slot", "_priorities")
-    _priorities: Tensor
+    _priorities: Any
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on but for the generator, on the CPU."""
@@ -110,9 +105,7 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
         names, size = ("_learned", "_sum_tree", "_min_tree"), self._max_capacity
         check_saved("sampler", state, names, _max_capacity=size)
         self._init()
-        room = self._priorities
         super()._restore(state)
-        self._priorities = room.copy_(self._priorities)
         check(NOT_NEGATIVE, alpha=self._alpha, beta=self._beta, eps=self._eps)
         # NaN where nothing was written, and there trees are left as they are made.
         slots = (~self._priorities.isnan()).nonzero().squeeze(1)

@@ -75,7 +75,8 @@ class SignalTable:
         self.reward_column = len(self.names)
         self.count_column = self.reward_column + 1
         self.time_column = self.reward_column + 2
-        self._blank = torch.full((1, self.reward_column + 3), torch.nan, dtype=torch.double)
+        columns = self.reward_column + 3
+        self._blank = torch.full((1, columns), torch.nan, dtype=torch.double, device="cpu")
         self._blank[0, self.count_column] = 0.0
         self.rows = self.blank(capacity, device)
         self.size = self.cleared = 0

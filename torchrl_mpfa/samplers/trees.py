@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Storage
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
-from torchrl_mpfa.native import find_loops, loops
+from torchrl_mpfa.native import address, find_loops, loops, opaque
 from torchrl_mpfa.storages.schema import as_integers
 
 _ORDERED = 2048
@@ -45,17 +45,26 @@ class CompiledTree:
     @property
     def _place(self) -> tuple[int, int, int]:
         """Address of the first node, numbers from node to node, and blocks of leaves."""
-        return self.nodes.data_ptr() + 8 * self._column, self.nodes.shape[1], self.blocks
+        start = address(self.nodes, torch.double) + 8 * self._column
+        return start, self.nodes.shape[1], self.blocks
+
+    @property
+    def priorities(self) -> Tensor:
+        """Priorities beside the leaves of three trees, a view, shape ``[N]``."""
+        first = 2 * self.blocks
+        return self.nodes[first : first + self.size, 3]
 
     def __getitem__(self, slots: Tensor) -> Tensor:
         return self.nodes.select(1, self._column)[slots + 2 * self.blocks]
 
+    @opaque
     def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
         slots, leaf = slots.contiguous(), leaf.double().expand(slots.shape).contiguous()
-        batch = slots.data_ptr(), leaf.data_ptr(), slots.numel()
+        batch = address(slots, torch.long), address(leaf, torch.double), slots.numel()
         if loops().set_leaves(*self._place, self.MINIMUM, self.size, *batch):
             raise IndexError(f"slots must be in [0, {self.size}), got {slots.tolist()}")
 
+    @opaque
     def query(self, start: int, end: int) -> float:
         """Return the sum or minimum of the leaves from ``start`` to before ``end``."""
         result: float = loops().query(*self._place, self.MINIMUM, self.size, start, end)
@@ -74,10 +83,11 @@ class SumTree(CompiledTree):
 
     EMPTY, MINIMUM = 0.0, False
 
+    @opaque
     def slots_at(self, shares: Tensor, size: int) -> Tensor:
         """Return the slots at shares of the sum of the first slots, shape ``[B]``."""
-        slots = torch.empty(shares.shape, dtype=torch.long)
-        batch = shares.data_ptr(), shares.numel(), slots.data_ptr()
+        slots = torch.empty(shares.shape, dtype=torch.long, device="cpu")
+        batch = address(shares, torch.double), shares.numel(), address(slots, torch.long)
         loops().find(*self._place, self.size, size, *batch)
         return slots
 
@@ -150,13 +160,15 @@ class MinLeaves(Leaves):
         return self._leaves[start:end].amin()
 
 
-def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor]:
-    """Return empty trees of sums, of minima and of minima, and priorities, NaN, shape ``[N]``."""
+def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor | None]:
+    """Return empty trees of sums, minima and minima, and priorities, NaN, shape ``[N]``.
+
+    The priorities are None where compiled trees have them.
+    """
     if device.type == "cpu" and find_loops() is not None:
         # Side by side: two children of a node are one line of the processor's cache.
-        nodes, first = _nodes(capacity, 4), 2 * _blocks(capacity)
-        kinds = enumerate((SumTree, MinTree, MinTree))
-        return [kind(capacity, nodes, n) for n, kind in kinds], nodes[first : first + capacity, 3]
+        nodes, kinds = _nodes(capacity, 4), enumerate((SumTree, MinTree, MinTree))
+        return [kind(capacity, nodes, n) for n, kind in kinds], None
     trees: list[Any]
     if device.type == "cpu":
         trees = [kind(capacity) for kind in (SumSegmentTreeFp64, *(MinSegmentTreeFp64,) * 2)]
@@ -173,7 +185,7 @@ def _blocks(capacity: int) -> int:
 def _nodes(capacity: int, trees: int) -> Tensor:
     """Return room for trees, NaN: for their nodes down to blocks, then for all leaves."""
     count = 2 * _blocks(capacity) + -(-capacity // _BLOCK) * _BLOCK
-    return torch.full((count, trees), torch.nan, dtype=torch.double)
+    return torch.full((count, trees), torch.nan, dtype=torch.double, device="cpu")
 
 
 def empty_tree_like(tree: Any, capacity: int, device: torch.device) -> Any:
@@ -193,7 +205,7 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     if isinstance(index, tuple):
         index = torch.stack([as_integers(places).reshape(-1) for places in index], -1)
     if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
-        return index
+        return index.resolve_neg()
     slots = as_integers(index)
     if slots.ndim <= 1 or len(slots) == 0:
         return slots.reshape(-1)

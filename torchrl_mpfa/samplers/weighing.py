@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
 _COUNT_REFRESH = 1 / 16
-_ENOUGH = 1000
+_ENOUGH = 100
 """With fewer rewards there is no warning that all are on one side."""
-_NO_WEIGHTS = torch.empty(0)
+_NO_WEIGHTS = torch.empty(0, device="cpu")
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,11 @@ def restored_weighing(
             f"'_weights' of the saved sampler must be of the signals {sorted(names)}, got "
             f"{sorted(state['_weights'])}"
         )
-    weights = torch.tensor([state["_weights"][name] for name in names], dtype=torch.double)
+    values = [state["_weights"][name] for name in names]
+    weights = torch.tensor(values, dtype=torch.double, device="cpu")
     check_not_negative("'_weights' of the saved sampler", weights)
     check_not_negative(
-        "mean reward of the saved sampler", torch.tensor(state["_mean_reward"]).abs()
+        "mean reward of the saved sampler", torch.tensor(state["_mean_reward"], device="cpu").abs()
     )
     return Weighing(
         weights.to(device),
@@ -101,7 +102,7 @@ def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weigh
         weighing = replace(weighing, weights=checked_weights(sampler.fusion, names, table, index))
     if due:
         if (text := one_sided(sampler)) is not None:
-            sampler.warn_once(text)
+            sampler.warn_once("one side", text)
         mean = float(table.rewards.mean())
         weighing = replace(weighing, mean_reward=mean, writes=table.writes)
     if not any(adjust.counts for adjust in sampler.adjustments):

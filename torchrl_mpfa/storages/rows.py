@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_mpfa.native import find_loops
+from torchrl_mpfa.native import address, find_loops, is_plain, opaque
 
 WIDTH = 4
 """Numbers of a column: addresses of what is stored and of the rows, bytes of a row, precision.
@@ -19,12 +19,13 @@ Precision is 4 or 8, -1 for other floating-point numbers, and 0 for all else."""
 _NUMBERS = {torch.float: 4, torch.double: 8}
 
 
+@opaque
 def rows_at(
     stored: Any, slots: Tensor, filled: int, more: Mapping[str, Tensor] | None = None
 ) -> TensorDict | None:
     """Return rows of a tensordict, batch size ``[B]``; None where PyTorch has to read them.
 
-    Further entries ``[B]`` take the place of stored ones.
+    Further entries, each of them ``[B, ...]``, take the place of stored ones.
     """
     columns: list[int] = []
     if (rows := _empty_rows(stored, len(slots), columns, more or {})) is None:
@@ -32,6 +33,7 @@ def rows_at(
     return None if _call("gather", columns, slots, filled) else rows
 
 
+@opaque
 def write_rows(stored: Any, slots: Tensor, data: TensorDict) -> bool:
     """Write rows of a tensordict; return False, and write nothing, where PyTorch has to."""
     columns: list[int] = []
@@ -46,7 +48,7 @@ def _call(loop: str, columns: list[int], slots: Tensor, end: int) -> int:
     table = array("q", columns)
     slots = slots.contiguous()
     rows = table.buffer_info()[0], len(columns) // WIDTH
-    wrong: int = getattr(find_loops(), loop)(*rows, slots.data_ptr(), len(slots), end)
+    wrong: int = getattr(find_loops(), loop)(*rows, address(slots, torch.long), len(slots), end)
     return wrong
 
 
@@ -62,7 +64,7 @@ def _empty_rows(
             if (below := _empty_rows(value, count, columns, {})) is None:
                 return None
             rows[key] = below
-        elif isinstance(value, Tensor) and value.is_cpu and value.is_contiguous():
+        elif isinstance(value, Tensor) and is_plain(value):
             rows[key] = row = value.new_empty((count, *value.shape[1:]))
             columns += (value.data_ptr(), row.data_ptr(), row.nbytes // count, 0)
         else:
@@ -95,14 +97,14 @@ def match_rows(
         elif (
             isinstance(into, Tensor)
             and isinstance(value, Tensor)
-            and into.is_cpu
-            and value.is_cpu
             and into.dtype is value.dtype
             and value.shape == (count, *into.shape[1:])
-            and into.is_contiguous()
+            and is_plain(into)
+            and value.layout is torch.strided
+            and is_plain(value := value.contiguous())
             and not value.is_complex()
         ):
-            values.append(value := value.contiguous())
+            values.append(value)
             number = _NUMBERS.get(value.dtype, -1 if value.is_floating_point() else 0)
             columns += (into.data_ptr(), value.data_ptr(), value.nbytes // count, number)
         else:

@@ -77,10 +77,10 @@ def as_index(index: Any) -> Any:
 def as_integers(index: Any) -> Tensor:
     """Return an index of any form but a tuple as a tensor of integers."""
     if isinstance(index, Tensor) and index.dtype is torch.long:
-        return index
+        return index.resolve_neg()
     index = as_index(index)
     try:
-        integers = torch.as_tensor(index)
+        integers = torch.as_tensor(index, device=getattr(index, "device", "cpu"))
     except (RuntimeError, TypeError, ValueError):
         raise TypeError(f"index must hold integers, got {index!r}") from None
     if integers.ndim and len(integers) == 0:
@@ -88,7 +88,7 @@ def as_integers(index: Any) -> Tensor:
     # A mask would be read as slots 0 and 1, and tensordicts in a list as nothing.
     if integers.dtype is torch.bool or integers.is_floating_point() or integers.is_complex():
         raise TypeError(f"index must hold integers, got {integers.dtype}")
-    return integers.long()
+    return integers.long().resolve_neg()
 
 
 def as_path(key: NestedKey) -> _Path:
@@ -154,6 +154,8 @@ def _check_form(expected: _Entry, value: object, lead: int, path: _Path, key: st
 
 
 def _check_finite(value: Tensor, lead: int, path: _Path) -> None:
+    if value.dtype.itemsize == 1:  # PyTorch cannot add up such numbers.
+        value = value.float()
     # A sum is finite only if all of its terms are, and costs a third of asking each of them.
     if math.isfinite(value.sum().item()):
         return

@@ -8,7 +8,7 @@ import json
 import mmap
 import os
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from ctypes import c_size_t, c_void_p
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorStorageCheckpointer
 
 from torchrl_mpfa.checks import check_counts, generator_on
 from torchrl_mpfa.native import find_loops
@@ -86,11 +86,8 @@ class SignalTensorStorage(LazyTensorStorage):
         """Return True if compiled loops may read and write a batch of slots."""
         return (
             self.ndim == 1
-            and isinstance(slots, Tensor)
-            and slots.dtype is torch.long
-            and slots.ndim == 1
-            and slots.is_cpu
-            and 0 < len(slots) <= self.max_size
+            and _is_batch(slots)
+            and len(slots) <= self.max_size
             and self.initialized
             and type(self._storage) is TensorDict
             and find_loops() is not None
@@ -111,21 +108,26 @@ class SignalTensorStorage(LazyTensorStorage):
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Write transitions."""
         cursor = as_index(cursor)
-        if (
-            set_cursor
-            and type(data) is TensorDict
-            and self._takes(cursor)
-            and write_rows(self._storage, cursor, data)
-        ):
-            self.note_written(cursor)
-            return
-        size = len(self)
+        size, before = len(self), None if self.initialized else vars(self).copy()
         try:
+            if set_cursor and type(data) is TensorDict and _is_batch(cursor):
+                if before is not None and self.ndim == data.ndim == 1:
+                    self._init(data[0])
+                if self._takes(cursor) and write_rows(self._storage, cursor, data):
+                    self.note_written(cursor)
+                    return
             super().set(cursor, data, set_cursor=set_cursor)
         except BaseException:
-            # TorchRL counts the rows before it writes them.
+            # TorchRL has counted the rows already, and taken the form of the first ones.
+            if before is not None:
+                self._forget_form()
+                self.__dict__.clear()
+                self.__dict__.update(before)
             self._len = size
             raise
+
+    def _forget_form(self) -> None:
+        """Remove what was made for the form of the first transitions."""
 
     def note_written(self, slots: Tensor) -> None:
         """Count transitions that were written in slots, the next ones, shape ``[B]``."""
@@ -184,6 +186,14 @@ class SignalTensorStorage(LazyTensorStorage):
                 of another capacity or form; nothing is changed.
         """
         path = open_dump(path)
+        checkpointer = self.checkpointer
+        if type(checkpointer) is not TensorStorageCheckpointer or checkpointer._load_hooks:
+            # In a form of its own, such as that of TED, which it makes rows of.
+            twin = LazyTensorStorage(self.max_size, ndim=self.ndim)
+            twin.checkpointer = checkpointer
+            twin.loads(path)
+            self.load_state_dict(twin.state_dict())
+            return
         notes = json.loads((path / "storage_metadata.json").read_text(encoding="utf-8"))
         rows = None if notes["is_pytree"] else TensorDict.load_memmap(path, allow_pickle=False)
         self._check_saved(rows, notes["len"])
@@ -248,6 +258,8 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
     _claim: NDArray[np.float64] | None = None
     """The begin of the file of the signals."""
     _file: Path
+    _files_before: Set[Path] = frozenset()
+    """Files in the folder that are not of these data."""
 
     def __init__(
         self,
@@ -270,27 +282,47 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
             table.move_to(torch.from_numpy(mapped))
         super().hold(table)
 
+    def _files(self) -> set[Path]:
+        """Return all files in the folder of the data."""
+        folder = getattr(self, "scratch_dir", None)
+        paths = [] if folder is None else Path(folder).rglob("*")
+        return {path for path in paths if path.is_file()}
+
     def _init(self, data: Any) -> None:
+        self._files_before = self._files()
         super()._init(data)
         # Texts and the like are kept in memory.
         leaves = tree_leaves(self._storage)
         entries = [entry for entry in leaves if isinstance(entry, MemoryMappedTensor)]
         files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
-        try:
-            for file in files:
+        for file, entry in zip(files, entries, strict=True):
+            if entry.numel():  # One without numbers has no file.
                 allocate(file)
-        except OSError:
-            self._storage, self.initialized = None, False
-            for entry in entries:
-                if entry._filename is not None:
-                    Path(entry._filename).unlink()
-            raise
         for entry in entries:
             _expect_random(entry)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the data, or raise ``ValueError`` for what could not be mapped again."""
+        self._check_mapped()
+        return super().state_dict()
+
+    def _check_mapped(self) -> None:
+        """Reject entries without numbers, which TensorDict maps at the first write alone."""
+        for entry in tree_leaves(self._storage):
+            if isinstance(entry, MemoryMappedTensor) and not entry.numel():
+                raise ValueError(
+                    f"entries must have numbers to be copied, got shape {[*entry.shape]}: write "
+                    "the transitions without it, or save by dumps(...)"
+                )
+
+    def _forget_form(self) -> None:
+        for file in self._files() - self._files_before:
+            file.unlink()
 
     def __getstate__(self) -> Any:
         state = {**super().__getstate__(), "_claim": None}
         if get_spawning_popen() is None:
+            self._check_mapped()
             # The copy has files of its own. Processes that TorchRL starts share those of this one.
             state |= {"scratch_dir": None, "_scratch_dir_is_temp": True}
             if self.initialized:
@@ -304,9 +336,20 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
             self._storage = data.memmap()
 
 
+def _is_batch(slots: Any) -> bool:
+    """Return True if an index is one slot or more in a tensor on the CPU, ``[B]``."""
+    return (
+        isinstance(slots, Tensor)
+        and slots.dtype is torch.long
+        and slots.ndim == 1
+        and slots.is_cpu
+        and len(slots) > 0
+    )
+
+
 def slots_of(storage: Any, index: Any) -> Tensor:
     """Return the flat slots that an index of a storage names, shape ``[B]``."""
-    slots = torch.arange(storage.max_size)
+    slots = torch.arange(storage.max_size, device="cpu")
     if storage.ndim > 1:
         slots = slots.reshape(storage._total_shape)
     return slots[list(index) if isinstance(index, range) else index].reshape(-1)

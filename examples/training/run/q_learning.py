@@ -11,10 +11,11 @@ from torch import Tensor, nn
 
 from torchrl_mpfa.checks import ABOVE_ZERO, SHARE, check, check_counts
 from torchrl_mpfa.learners.dqn import reject_part
-from torchrl_mpfa.learners.optimized import check_alike, check_losses
+from torchrl_mpfa.learners.optimized import check_form, check_losses
 from torchrl_mpfa.losses import read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.deterministic import OUT_KEYS, with_best
+from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, as_sampled
 from torchrl_mpfa.signals import TD_ERROR
 
@@ -176,6 +177,7 @@ class TabularQLearner:
         Raises:
             ValueError: If its table is of another size, or not finite; nothing is changed then.
         """
-        check_alike("learner", state_dict, self.state_dict())
+        check_form("the saved learner", state_dict, self.state_dict())
+        check_saved_numbers("learner", state_dict)
         self.table.copy_(state_dict["networks"]["table"])
         self.updates = state_dict["updates"]

@@ -1,11 +1,15 @@
 """ActorCritic: target networks, gradients, saving, arguments."""
 
+import copy
+
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.objectives import SoftUpdate
 
 from tests.mpfa.learning import KINDS, differentiate, make_batch, make_learner, make_torchrls
-from torchrl_mpfa import Learner
+from torchrl_mpfa import ActorCritic, Learner, make_critic
 
 
 def pairs(learner):
@@ -74,3 +78,40 @@ def test_actor_and_critic_learn_at_their_own_rates(kind):
 
 def test_learner_has_the_methods_of_the_protocol():
     assert isinstance(make_learner(), Learner)
+
+
+class Masked(nn.Module):
+    """An actor with a causal mask, and a lowest value that begins at infinity."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(3, 1)
+        self.register_buffer("mask", torch.full((3, 3), -torch.inf).triu(1))
+        self.register_buffer("lowest", torch.tensor(torch.inf))
+
+    def forward(self, observation):
+        raw = self.layer(observation)
+        return raw, raw.tanh()
+
+
+def make_masked():
+    keys = ["preactivation", "action"]
+    actor = TensorDictModule(Masked(), in_keys=["observation"], out_keys=keys)
+    return ActorCritic(actor, make_critic(3, 1, width=8), bounds=(-1.0, 1.0))
+
+
+def test_what_is_no_parameter_may_be_infinite_in_a_saved_state():
+    first, second = make_masked(), make_masked()
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    for name, value in first.networks.state_dict().items():
+        assert torch.equal(second.networks.state_dict()[name], value)
+
+
+def test_a_parameter_that_is_not_finite_is_rejected_at_the_save():
+    learner = make_masked()
+    with torch.no_grad():
+        next(learner.networks.parameters()).fill_(torch.nan)
+    with pytest.raises(ValueError, match="the saved learner must be finite, got nan in"):
+        learner.state_dict()
+    learner.load_state_dict(make_masked().state_dict())  # It can be mended.
+    assert learner.state_dict()

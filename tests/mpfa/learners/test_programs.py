@@ -10,7 +10,7 @@ import torch
 from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
-from tests.mpfa.compiled import UNTRACED, assert_alike, counting, fail_with, make_pair, update_both
+from tests.mpfa.compiled import UNTRACED, assert_alike, counting, make_pair, update_both
 from tests.mpfa.learning import BOUNDS, make_batch, make_learner, make_networks
 from torchrl_mpfa import ActorCritic
 from torchrl_mpfa.learners import compiled as program
@@ -89,18 +89,29 @@ def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, mo
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
     make_pair("ddpg")
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
-    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
-    monkeypatch.setattr(Path, "chmod", fail_with(PermissionError("not yours")))
-    with pytest.raises(PermissionError, match="must be a folder of your own: set XDG_CACHE_HOME"):
-        make_pair("ddpg")
 
 
-def test_programs_without_a_folder_of_the_user_stay_in_that_of_pytorch(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+@pytest.mark.parametrize("cache", ["no folder", "a folder of another user"])
+def test_programs_without_a_folder_of_the_user_stay_in_one_of_this_process(
+    cache, tmp_path, monkeypatch
+):
+    # The folder that PyTorch has by default is one that others can make.
+    if cache == "no folder":
+        (tmp_path / "torchrl_mpfa").touch()
+    else:
+        (tmp_path / "torchrl_mpfa").mkdir(mode=0o700)
+        monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
-    make_pair("ddpg")
-    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == default_cache_dir()
+    program._folder_of_this_process.cache_clear()
+    with pytest.warns(UserWarning, match="programs are compiled at every start"):
+        make_pair("ddpg")
+    folder = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert not folder.is_relative_to(tmp_path) and str(folder) != default_cache_dir()
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
+    make_pair("ddpg")  # Says so once.
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(folder)
 
 
 @pytest.mark.parametrize(

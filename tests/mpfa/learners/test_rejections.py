@@ -122,7 +122,7 @@ FIRST, GROUP = ["optimizer", "state", 0], ["optimizer", "param_groups", 0]
     [
         ([], None, "the saved learner must be .*, got None"),
         (["optimizer"], MISSING, "the saved learner lacks 'optimizer'"),
-        (["loss"], {}, "the saved learner is of version 0.4, which is not read: finish its run"),
+        (["loss"], {}, "the saved learner must not have 'loss'"),
         (["updates"], MISSING, "the saved learner lacks 'updates'"),
         (["updates"], "3", "the saved learner, 'updates' must be 3, got '3'"),
         (["optimizer", "state"], MISSING, "the saved learner, 'optimizer' lacks 'state'"),

@@ -1,8 +1,6 @@
-"""Compiled loops do what PyTorch does, are made where they are not there, and can be missing."""
+"""Compiled loops do what PyTorch does."""
 
 import copy
-import subprocess
-import sys
 from itertools import product
 
 import pytest
@@ -25,7 +23,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     native,
 )
-from torchrl_mpfa.native.build import compile_library
 from torchrl_mpfa.samplers.trees import MinTree, SumTree, set_leaves, slots_at
 
 CAPACITY, BATCH = 37, 8
@@ -273,59 +270,6 @@ def test_each_storage_of_this_package_is_written_by_compiled_loops(kind, monkeyp
     slots = buffer.extend(rows)
     assert slots.tolist() == [4, 5, 6]
     assert buffer[slots]["observation"].equal(rows["observation"])
-
-
-def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv("CC", raising=False)
-    native.find_loops.cache_clear()
-    assert native.find_loops() is None
-    buffer = make_buffer(16)
-    buffer.extend(make_transitions(16))
-    buffer.update_tensordict_priority(write_signals(buffer.sample()))
-    assert list((tmp_path / "torchrl_mpfa").iterdir()) == []
-
-
-def test_a_folder_of_caches_that_is_no_folder_leaves_it_to_pytorch(monkeypatch, tmp_path):
-    (tmp_path / "torchrl_mpfa").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.find_loops.cache_clear()
-    assert native.find_loops() is None
-
-
-def test_others_cannot_write_to_the_folder_of_what_is_loaded(monkeypatch, tmp_path):
-    (tmp_path / "torchrl_mpfa").mkdir(mode=0o777)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.find_loops.cache_clear()
-    assert native.find_loops() is not None
-    assert (tmp_path / "torchrl_mpfa").stat().st_mode & 0o777 == 0o700
-
-
-def test_a_compiler_that_fails_leaves_no_file(monkeypatch, tmp_path):
-    monkeypatch.setenv("CC", "false")
-    assert not compile_library(tmp_path / "replay.so")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_damaged_library_is_compiled_again(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.find_loops.cache_clear()
-    assert native.find_loops() is not None
-    (made,) = (tmp_path / "torchrl_mpfa").iterdir()
-    # Not in place: this process has it mapped.
-    made.unlink()
-    made.write_bytes(b"not a library")
-    native.find_loops.cache_clear()
-    assert native.find_loops() is not None
-
-
-def test_a_first_use_in_two_processes_at_once_gives_both_the_loops(tmp_path):
-    program = "from torchrl_mpfa.native import find_loops; assert find_loops() is not None"
-    environment = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
-    command = [sys.executable, "-c", program]
-    runs = [subprocess.Popen(command, env=environment) for _ in range(2)]
-    assert [run.wait() for run in runs] == [0, 0]
 
 
 def test_several_threads_write_and_sample_one_buffer(monkeypatch):

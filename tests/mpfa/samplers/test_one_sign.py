@@ -98,7 +98,7 @@ def test_the_mean_is_that_of_the_buffer_and_saved():
     assert train_rounds(first, 3).equal(train_rounds(second, 3))
 
 
-@pytest.mark.parametrize("rewards", [torch.rand(999), torch.rand(1500) - 0.5])
+@pytest.mark.parametrize("rewards", [torch.rand(99), torch.rand(1500) - 0.5])
 def test_few_rewards_or_rewards_of_both_signs_are_no_reason_for_a_warning(rewards):
     buffer = make_buffer(2000, 32, entropy_refresh=0)
     buffer.extend(make_transitions(len(rewards), rewards=rewards))
@@ -117,3 +117,13 @@ def test_boost_alone_waits_for_rewards_above_a_level_and_not_for_positive_ones()
     train(1.0)
     with pytest.warns(UserWarning, match="none of the 1200 rewards in the buffer are above 0"):
         train(0.0)
+
+
+def test_the_warning_comes_once_whatever_the_number_of_rewards():
+    buffer = make_buffer(20_000, 32)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for turn in range(20):
+            buffer.extend(make_transitions(200, rewards=-torch.rand(200) - 0.1, seed=turn))
+            train_rounds(buffer, 1)
+    assert sum("rewards in the buffer are" in str(warning.message) for warning in caught) == 1

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict, lazy_stack
 from torchrl.data import LazyTensorStorage, TensorDictMaxValueWriter
 
+from tests.mpfa.compiled import fail_with
 from tests.mpfa.transitions import (
     make_buffer,
     make_filled,
@@ -14,7 +15,15 @@ from tests.mpfa.transitions import (
     seeded,
     write_signals,
 )
-from torchrl_mpfa import Signal, SignalMemmapStorage, SignalTensorStorage
+from torchrl_mpfa import (
+    MPFASampler,
+    Signal,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    native,
+)
+from torchrl_mpfa.storages import tensor
 
 KINDS = ["memory", "memmap", "memmap_scratch"]
 
@@ -175,3 +184,32 @@ def test_rows_that_are_written_out_of_order_count_as_in_torchrl():
         for slot in (0, 5, 5):
             storage.set(torch.tensor([slot]), rows.clone())
     assert len(ours) == len(theirs) == 3
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_a_first_write_that_fails_leaves_no_form(kind, tmp_path, monkeypatch):
+    storage = kind(8, **({"scratch_dir": tmp_path} if kind is SignalMemmapStorage else {}))
+    files = sorted(tmp_path.rglob("*"))
+    wrong = TensorDict({"a": torch.zeros(3, 2), "b": torch.zeros(3, 1)}, [3])
+    with monkeypatch.context() as patched:
+        patched.setattr(TensorDict, "__setitem__", fail_with(RuntimeError("no room")))
+        patched.setattr(tensor, "write_rows", fail_with(RuntimeError("no room")))
+        with pytest.raises(RuntimeError, match="no room"):
+            storage.set(torch.arange(3), wrong)
+    assert len(storage) == 0 and not storage.initialized
+    assert sorted(tmp_path.rglob("*")) == files
+    storage.set(torch.arange(3), TensorDict({"a": torch.ones(3, 1)}, [3]))
+    assert storage.get(torch.arange(3))["a"].tolist() == [[1.0]] * 3
+
+
+@pytest.mark.skipif(native.find_loops() is None, reason="PyTorch writes no such numbers")
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.float8_e4m3fn])
+def test_numbers_that_pytorch_cannot_write_by_index_are_stored_from_the_first_write(dtype):
+    storage = SignalTensorStorage(8)
+    buffer = SignalReplayBuffer(storage=storage, sampler=MPFASampler(), batch_size=4)
+    numbers = torch.arange(6.0).reshape(3, 2).to(dtype)
+    for turn in range(2):
+        rows = {"depth": numbers, "next": {"reward": torch.rand(3, 1)}}
+        slots = buffer.extend(TensorDict(rows, [3]))
+        stored = buffer.storage.get(slots)["depth"]
+        assert stored.view(torch.uint8).equal(numbers.view(torch.uint8)), turn
