@@ -1,4 +1,4 @@
-"""Robots whose files name parameter files of ``diff_drive_controller`` and Nav2."""
+"""Robots whose files name parameter files of ``diff_drive_controller``, Nav2 and ROS 1."""
 
 from __future__ import annotations
 
@@ -210,3 +210,201 @@ def test_an_error_names_the_line_of_both_files(text: str, message: str, tmp_path
     own |= {"min_wheel_speed": -0.5} if "max_vel" in text else {"max_wheel_speed": 0.5}
     with pytest.raises(RobotFileError, match=rf"cart\.yaml:1: .*controller0\.yaml{message}"):
         robot_of(tmp_path, own, text)
+
+
+COSTMAP = "local_costmap: {local_costmap: {ros__parameters: {robot_radius: 0.22}}}\n"
+DWB = (
+    "controller_server: {ros__parameters: {FollowPath: {min_vel_x: -0.5, max_vel_x: 0.5, "
+    "acc_lim_x: 2.5, decel_lim_x: -2.5, max_vel_theta: 2.0, acc_lim_theta: 3.2}}}\n"
+)
+BARE = {"wheel_base": 0.3, "wheel_radius": 0.04, "radius": 0.2}
+FAST = {"max_wheel_speed": 0.9, "min_wheel_speed": -0.9}
+
+
+def smoother(**lists: list[float]) -> str:
+    """The file of Nav2's last node before the wheels."""
+    entries = ", ".join(f"{name}: {values}" for name, values in lists.items())
+    return f"velocity_smoother: {{ros__parameters: {{smoothing_frequency: 20.0, {entries}}}}}\n"
+
+
+def plugin(parameters: str, name: str = "FollowPath") -> str:
+    return f"controller_server: {{ros__parameters: {{{name}: {{{parameters}}}}}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (smoother(max_velocity=[0.2, 0.0, 0.5]), {"max_wheel_speed": 0.2, "turn_limit": 0.5}),
+        (smoother(min_velocity=[-0.1, 0.0, -0.6]), {"min_wheel_speed": -0.1, "turn_limit": 0.6}),
+        (
+            smoother(max_accel=[0.4, 0.0, 1.2], max_decel=[-0.3, 0.0, -1.1]),
+            {"wheel_acceleration": 0.4, "deceleration": 0.3, "turn_acceleration": 1.1},
+        ),
+        (
+            smoother(max_velocity=[0.2, 0.0, 0.0, 0.0, 0.0, 0.7]),
+            {"max_wheel_speed": 0.2, "turn_limit": 0.7},
+        ),
+        (
+            plugin("vx_max: 0.3, vx_min: -0.2, wz_max: 0.4, ax_max: 1.0, ax_min: -2, az_max: 1.5"),
+            {
+                "max_wheel_speed": 0.3,
+                "min_wheel_speed": -0.2,
+                "turn_limit": 0.4,
+                "wheel_acceleration": 1.0,
+                "deceleration": 2.0,
+                "turn_acceleration": 1.5,
+            },
+        ),
+        (
+            plugin(
+                "desired_linear_vel: 0.3, rotate_to_heading_angular_vel: 0.8, "
+                "max_angular_accel: 1.6, allow_reversing: false"
+            ),
+            {
+                "max_wheel_speed": 0.3,
+                "turn_limit": 0.8,
+                "turn_acceleration": 1.6,
+                "reverse": False,
+            },
+        ),
+        (
+            plugin(
+                "max_linear_vel: 0.3, min_linear_vel: -0.1, max_angular_vel: 0.9, "
+                "min_angular_vel: -0.8, max_linear_accel: 1.0, max_linear_decel: -0.9, "
+                "max_angular_accel: 2.0, max_angular_decel: -1.8"
+            ),
+            {
+                "max_wheel_speed": 0.3,
+                "min_wheel_speed": -0.1,
+                "turn_limit": 0.8,
+                "wheel_acceleration": 1.0,
+                "deceleration": 0.9,
+                "turn_acceleration": 1.8,
+            },
+        ),
+        (
+            plugin("v_linear_min: 0.1, v_linear_max: 0.4, v_angular_max: 0.7, v_angular_min: 0.2"),
+            {"max_wheel_speed": 0.4, "min_wheel_speed": -0.5, "turn_limit": 0.7},
+        ),
+        (plugin("max_speed_xy: 0.45, decel_lim_theta: -3.0"), {"max_wheel_speed": 0.45}),
+        (plugin("max_speed_xy: -1.0, decel_lim_theta: -3.0"), {"turn_acceleration": 3.0}),
+        (
+            "TebLocalPlannerROS: {max_vel_x: 0.42, max_vel_x_backwards: 0.11, max_vel_trans: 0.0}",
+            {"max_wheel_speed": 0.42, "min_wheel_speed": -0.11, "reverse": True},
+        ),
+        ("TebLocalPlannerROS: {max_vel_x_backwards: 0.0}", {"reverse": False}),
+        (
+            "DWAPlannerROS: {max_trans_vel: 0.3, max_rot_vel: 0.9, min_rot_vel: 0.4, "
+            "acc_lim_x: 1.0, acc_lim_th: 1.7}",
+            {"max_wheel_speed": 0.3, "turn_limit": 0.9, "turn_acceleration": 1.7},
+        ),
+        (
+            "TrajectoryPlannerROS: {max_rotational_vel: 0.8, min_vel_theta: -0.7, acc_limit_x: 1}",
+            {"turn_limit": 0.7, "wheel_acceleration": 1.0},
+        ),
+        (
+            "speed_lim_v: 0.2\nspeed_lim_w: 0.6\naccel_lim_v: 0.5\naccel_lim_w: 1.5\n",
+            {
+                "max_wheel_speed": 0.2,
+                "turn_limit": 0.6,
+                "wheel_acceleration": 0.5,
+                "turn_acceleration": 1.5,
+            },
+        ),
+        (
+            "base_controller: {left_wheel: a, right_wheel: b, linear: {x: {max_velocity: 0.2, "
+            "max_acceleration_reverse: 0.8}}, angular: {z: {min_velocity: -0.9}}}",
+            {"max_wheel_speed": 0.2, "wheel_acceleration": 0.8, "turn_limit": 0.9},
+        ),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_the_smallest_limit_counts_by_whatever_name(
+    text: str, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    robot = robot_of(tmp_path, BARE, COSTMAP + DWB, text)
+    assert values_of(robot, expected) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("cruise_speed_limit: 0.2", "max_wheel_speed"),
+        ("limits: {maxLinearVelocity: 0.2}", "max_wheel_speed"),
+        ("velocity_smoother: {max_velocity: 0.2}", "max_wheel_speed"),
+        ("max_backward_speed: 0.1", "min_wheel_speed"),
+        ("limiter: {angular: {max_velocity: 0.5}}", "turn_limit"),
+        ("limiter: {linear: {x: {max_velocity: 0.2}}}", "max_wheel_speed"),
+        ("acceleration_limits: [0.5, 0.5]", "wheel_acceleration"),
+        ("maximum_deceleration: 0.5", "deceleration"),
+        ("max_yaw_acc: 0.5", "turn_acceleration"),
+    ],
+)
+def test_a_limit_of_an_unknown_name_must_stand_in_the_robots_file(
+    text: str, field: str, tmp_path: Path
+) -> None:
+    own = BARE | FAST
+    own = {key: own[key] for key in own if key != field}
+    key = text.rpartition("{")[2].partition(":")[0]
+    message = rf"controller0\.yaml:3: (.*\.)?{key} is a limit that is not read: write {field} in"
+    with pytest.raises(RobotFileError, match=message):
+        robot_of(tmp_path, own, COSTMAP + DWB + text)
+    limit = -0.1 if field == "min_wheel_speed" else 0.2
+    assert getattr(robot_of(tmp_path, own | {field: limit}, COSTMAP + DWB + text), field) == limit
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "docking_server: {ros__parameters: {controller: {v_linear_max: 0.05, v_angular_max: 0.1}}}",
+        "behavior_server: {ros__parameters: {max_rotational_vel: 0.1, rotational_acc_lim: 0.1}}",
+        "collision_monitor: {ros__parameters: {Slow: {linear_limit: 0.1, max_speed: 0.1}}}",
+        "/robot/following_server: {ros__parameters: {controller: {v_linear_max: 0.05}}}",
+        "teleop_twist_joy: {ros__parameters: {max_speed: 0.1}}",
+        "joint_limits: {arm: {has_velocity_limits: true, max_velocity: 0.1}}",
+        "mecanum: {wheel_separation_x: 0.2, linear.x.max_velocity: 0.1}",
+        "x: {min_x_velocity_threshold: 0.1, deadband_velocity: [0.1, 0, 0.1], max_vel_y: 0.1, "
+        "min_speed_xy: -0.1, weight_max_vel_x: 0.1, speed_limit_topic: a, limit_vel: true}",
+    ],
+)
+def test_a_limit_of_what_does_not_drive_to_a_goal_does_not_count(text: str, tmp_path: Path) -> None:
+    expected = robot_of(tmp_path, BARE, COSTMAP + DWB)
+    assert robot_of(tmp_path, BARE, COSTMAP + DWB + text) == expected
+
+
+@pytest.mark.parametrize(
+    ("plugins", "speed"),
+    [
+        ("controller_plugins: [FollowPath, Slow], FollowPath: {max_vel_x: 0.5}", 0.5),
+        ("controller_plugins: [Slow, FollowPath], FollowPath: {max_vel_x: 0.5}", 0.5),
+        ("controller_plugins: [FollowPath], FollowPath: {max_vel_x: 0.5}", 0.5),
+        ("controller_plugins: [Fast, DockingController], Fast: {max_vel_x: 0.5}", 0.5),
+        ("controller_plugins: [Fast, Slow], Fast: {max_vel_x: 0.5}", 0.05),
+        ("Fast: {max_vel_x: 0.5}, DockApproach: {max_vel_x: 0.05}", 0.5),
+    ],
+)
+def test_of_several_controllers_the_one_that_drives_counts(
+    plugins: str, speed: float, tmp_path: Path
+) -> None:
+    others = ", ".join(
+        f"{name}: {{plugin: p, max_vel_x: 0.05, inner: {{vx_max: 0.05}}}}"
+        for name in ("Slow", "DockingController")
+    )
+    text = f"controller_server: {{ros__parameters: {{{plugins}, {others}}}}}\n"
+    if "controller_plugins" not in plugins:
+        text = f"controller_server: {{ros__parameters: {{{plugins}}}}}\n"
+    robot = robot_of(tmp_path, BARE | {"min_wheel_speed": -0.04}, text + COSTMAP)
+    assert robot.max_wheel_speed == speed
+
+
+def test_a_rotation_that_is_switched_off_does_not_limit_the_turn(tmp_path: Path) -> None:
+    text = plugin("use_rotate_to_heading: false, rotate_to_heading_angular_vel: 0.0")
+    assert robot_of(tmp_path, BARE, DWB, text + COSTMAP).turn_limit == 2.0
+
+
+def test_a_list_of_a_smoother_must_have_an_entry_for_each_axis(tmp_path: Path) -> None:
+    text = smoother(max_velocity=[0.2, 0.5])
+    with pytest.raises(
+        RobotFileError, match=r":1: max_velocity must be \[x, y, theta\] or .*got 2"
+    ):
+        robot_of(tmp_path, BARE, text)

@@ -257,3 +257,27 @@ def test_a_wheel_is_not_ordered_below_its_least_speed(slowest: float) -> None:
     able.begin((3.0, 1.0))
     command = able.decide(scan, (0.0, 0.0, 0.0), (0.1, 0.0))
     assert command.linear == 0.0 and command.left == -command.right
+
+
+@pytest.mark.parametrize("facts", [{}, {"memory": "map", "observation_size": 27}])
+@pytest.mark.parametrize(
+    ("wrong", "error", "message"),
+    [
+        ({"ranges": [None] * 360}, ScanError, "ranges must be real numbers, got"),
+        ({"ranges": [*[1.0] * 359, "2"]}, ScanError, "ranges must be real numbers, got"),
+        ({"angle_increment": None}, ScanError, "angle_increment must be a real number, got None"),
+        ({"time": "now"}, ValueError, "time must be a finite number, got 'now'"),
+        ({"age": math.nan}, ValueError, "age must be a finite number, got nan"),
+    ],
+)
+def test_a_decision_by_what_is_no_number_is_rejected_by_name(
+    facts: dict[str, Any], wrong: dict[str, Any], error: type[ValueError], message: str
+) -> None:
+    pilot = Pilot(card(**facts), lambda seen: np.ones((1, 2), np.float32))
+    scan = Scan(-math.pi, math.pi / 180, [3.0] * 360)
+    times = {name: wrong[name] for name in ("time", "age") if name in wrong}
+    wrong = {name: wrong[name] for name in wrong if name not in times}
+    pilot.begin((3.0, 0.0))
+    with pytest.raises(error, match=f"^{message}"):
+        pilot.decide(scan._replace(**wrong), (0.0, 0.0, 0.0), (0.0, 0.0), **times)
+    assert pilot.decide(scan, (0.0, 0.0, 0.0), (0.0, 0.0)).linear > 0.0

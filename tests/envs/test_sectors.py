@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,6 +208,70 @@ def test_a_scan_has_as_many_ranges_as_its_angles_say(count: int, off: int) -> No
 def test_a_scan_that_says_nothing_is_rejected(scan: Scan, message: str, silent: str) -> None:
     with pytest.raises(ScanError, match=message):
         Sectors(card(), silent=silent).read(scan)
+
+
+ALL_AROUND = Scan(-math.pi, math.pi / 180, [1.0] * 360, 0.1, 8.0)
+NO_NUMBERS: list[Any] = [
+    None,
+    "1.0",
+    b"11",
+    {1.0: 2.0},
+    object(),
+    *([1.0] * 359 + [bad] for bad in ("1.0", None, True, 1j, [1.0], [], np.datetime64("2026"))),
+    [1.0] * 359 + [np.ma.masked],
+    [10**400] * 360,
+    ["far"] * 360,
+    np.array(["1.0"] * 360),
+    np.ones(360, dtype=np.bool_),
+    np.array([1.0] * 359 + [True], dtype=object),
+    np.ones(360, dtype=np.complex128),
+    np.ma.array(np.ones(360), mask=[False] * 359 + [True]),
+    np.zeros(360, dtype=[("range", float)]),
+    iter([1.0] * 360),
+]
+
+
+@pytest.mark.parametrize("ranges", NO_NUMBERS, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize("method", ["read", "around", "blind"])
+def test_ranges_that_are_no_numbers_are_rejected_by_name(ranges: Any, method: str) -> None:
+    with pytest.raises(ScanError, match=r"^ranges must be real numbers, got "):
+        getattr(Sectors(card()), method)(ALL_AROUND._replace(ranges=ranges))
+
+
+@pytest.mark.parametrize("name", [name for name in Scan._fields if name != "ranges"])
+@pytest.mark.parametrize(
+    "value", ["0.1", None, True, 1j, np.complex64(0), [0.1], np.ma.masked, 10**400, object()]
+)
+def test_a_fact_of_a_scan_that_is_no_number_is_rejected_by_name(name: str, value: Any) -> None:
+    if (name, value) == ("angle_max", None):
+        return
+    with pytest.raises(ScanError, match=f"^{name} must be a real number, got "):
+        Sectors(card()).read(ALL_AROUND._replace(**{name: value}))
+
+
+@pytest.mark.parametrize("scan", [None, (0.0, 0.1, [1.0]), {"ranges": [1.0]}, 3])
+def test_what_is_no_scan_is_rejected(scan: Any) -> None:
+    with pytest.raises(ScanError, match=r"^scan must have angle_min, .*got "):
+        Sectors(card()).read(scan)
+
+
+@pytest.mark.parametrize(
+    "ranges",
+    [
+        array("f", [1.0] * 360),
+        tuple([1] * 360),
+        np.ones(360, dtype=np.float16),
+        np.ma.array(np.ones(360)),
+        [np.float32(1.0)] * 360,
+        np.array([1] * 360, dtype=object),
+        [10**30, *[1.0] * 359],
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_ranges_may_be_numbers_of_any_type(ranges: Any) -> None:
+    start, step = np.float32(-math.pi), np.array(math.pi / 180)
+    scan = ALL_AROUND._replace(angle_min=start, angle_increment=step, ranges=ranges)
+    assert Sectors(card()).read(scan)[0].tolist() == [1.0] * 18
 
 
 RANGES = np.linspace(0.3, 7.9, 360)

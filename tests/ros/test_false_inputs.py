@@ -321,6 +321,40 @@ def test_a_scan_in_another_unit_stops_it(sees: Sees, reason: str) -> None:
     assert loop.stands
 
 
+def without_numbers(scan: Scan, _: float) -> Scan:
+    return scan._replace(ranges=[None] * len(np.asarray(scan.ranges)))
+
+
+def masked(scan: Scan, _: float) -> Scan:
+    return scan._replace(ranges=np.ma.masked_less(np.asarray(scan.ranges), 3.5))
+
+
+def ragged(scan: Scan, _: float) -> Scan:
+    return scan._replace(ranges=[*np.asarray(scan.ranges)[1:], [1.0]])
+
+
+@pytest.mark.parametrize("sees", [without_numbers, masked, ragged])
+def test_a_scan_that_is_no_numbers_stops_it_while_it_lasts(sees: Sees) -> None:
+    loop = Loop()
+    loop.run(0.5)
+    order = loop.run(0.5, sees)
+    assert order is not None and order.reason.startswith("ranges must be real numbers, got ")
+    assert loop.stands
+    assert loop.run(0.2).reason == "driving"
+
+
+@pytest.mark.parametrize("stamp", [None, "0.5", 1j, True])
+def test_a_stamp_that_is_no_number_stops_it_while_it_lasts(stamp: Any) -> None:
+    loop = Loop()
+    loop.run(0.5)
+    now = loop.robot.time
+    loop.controller.see(loop.robot.scan(), stamp)
+    order = loop.controller.tick(now)
+    assert order is not None
+    assert order == (0.0, 0.0, f"time must be a real number, got {stamp!r}")
+    assert loop.run(0.2).reason == "driving"
+
+
 def still_wheels(slowest: float = 0.0) -> Any:
     """A TurtleBot2 whose wheels can stand, or turn backwards."""
     return replace(ROBOTS["turtlebot2"], min_wheel_speed=slowest)

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 from mpfa_envs.deploy.card import Card, CardError, Network, card_file, read_exported
 from mpfa_envs.deploy.pilot import Command, Pilot
-from mpfa_envs.sensing.sectors import Points, Scan, ScanError, Sectors
+from mpfa_envs.sensing.scan import Scan, ScanError
+from mpfa_envs.sensing.sectors import Points, Sectors
 
 __all__ = [
     "Card",

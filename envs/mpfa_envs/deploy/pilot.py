@@ -15,7 +15,8 @@ from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan
 from mpfa_envs.robots.drives import Orders
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.sensing.sectors import Scan, ScanError, Sectors, Silent, observations_from
+from mpfa_envs.sensing.scan import Scan, ScanError
+from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
     import os
@@ -315,9 +316,9 @@ class Pilot:
         pair_of("pose", (x, y))
         motion = np.array((x, y, heading, *check_finite("speeds", speeds, 2)))
         taken = np.array(check_finite("scan_pose", scan_pose or (x, y, heading), 3))
-        self._time = self._time + self.period if time is None else time
+        self._time = self._time + self.period if time is None else check_number("time", time)
         ahead = self._orders.states(
-            motion, age, self._time, self.latency, certain=not self.has_filter
+            motion, check_number("age", age), self._time, self.latency, certain=not self.has_filter
         )
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
@@ -366,7 +367,7 @@ class Pilot:
             ScanError: Also if it would drive where it does not see and cannot turn on the spot.
         """
         if not self.arrived(pose) and self._arrival.turns:
-            self._time = self._time + self.period if time is None else time
+            self._time = self._time + self.period if time is None else check_number("time", time)
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
         observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)

@@ -19,13 +19,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_not_negative, check_positive
+from mpfa_envs.sensing.scan import ScanError, check_real, in_numbers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.pilot import Command, Pilot
     from mpfa_envs.robots.model import RobotModel
-    from mpfa_envs.sensing.sectors import Points, Scan
+    from mpfa_envs.sensing.scan import Scan
+    from mpfa_envs.sensing.sectors import Points
     from mpfa_envs.worlds.world import World
 
 Pose = tuple[float, float, float]
@@ -82,16 +84,18 @@ class LaserInput:
 
     def take(self, scan: Scan, time: float, odometry: OdometryInput) -> None:
         """Take a scan and its time [s]."""
+        moment = math.nan
         try:
+            moment = check_real("time", time)
+            scan = in_numbers(scan)
             self._sectors.read(scan)
             points = self._sectors.around(scan)
-        # ScanError, and what NumPy says of what is no array of numbers.
-        except ValueError as error:
-            self.last = LaserReading(scan, time, fault=str(error))
+        except ScanError as error:
+            self.last = LaserReading(scan, moment, fault=str(error))
             return
-        repeated = self._repeats(scan, time, points, odometry)
+        repeated = self._repeats(scan, moment, points, odometry)
         self.last = LaserReading(
-            scan, self._since if repeated else time, *self._obstacles(scan, points), repeated
+            scan, self._since if repeated else moment, *self._obstacles(scan, points), repeated
         )
 
     def _obstacles(self, scan: Scan, points: Points) -> tuple[float, float, str]:
@@ -115,6 +119,8 @@ class LaserInput:
         if self.last is None:
             return "no scan"
         age = now - self.last.time
+        if math.isnan(age) and self.last.fault:
+            return self.last.fault
         if not -_AHEAD <= age <= timeout:
             return f"{'repeated' if self.last.repeated else 'stale'} scan: {age:.1f} s old"
         return self.last.fault

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpfa_envs.sensing.sectors import Scan
+from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.worlds.shapes import OccupancyGrid
 from mpfa_envs.worlds.world import World
 

@@ -13,7 +13,7 @@ from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.robots.drives import Physics, make_drives
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.lidar import Lidar
-from mpfa_envs.sensing.sectors import Scan
+from mpfa_envs.sensing.scan import Scan
 
 if TYPE_CHECKING:
     import os

@@ -10,9 +10,10 @@ import numpy as np
 from mpfa_envs.checks import MEANT, check_choice, check_positive
 from mpfa_envs.robots.model import check_mount
 from mpfa_envs.sensing.observation import lidar_pose, look_from, observe_all
+from mpfa_envs.sensing.scan import Scan, ScanError, in_numbers
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
 
@@ -33,32 +34,6 @@ _FARTHEST = MEANT["max_range"][1], 1e5
 more than the second."""
 _TURNS = 1.05
 """Turns that the rays may cover: those of some drivers overlap a little."""
-
-
-class ScanError(ValueError):
-    """A scan lacks information that the policy needs; the message says which."""
-
-
-class Scan(NamedTuple):
-    """The measurements of a planar lidar, as in ``sensor_msgs/LaserScan``.
-
-    A range of ``range_max`` or more, infinity too, has met nothing. One between 0 and
-    ``range_min``, and minus infinity, has met something nearer than the sensor can measure. Zero,
-    negative numbers and NaN are not valid.
-    """
-
-    angle_min: float
-    """Direction of the first ray, from the sensor's x axis to the left [rad]."""
-    angle_increment: float
-    """From ray to ray; negative for a sensor that turns to the right [rad]."""
-    ranges: ArrayLike
-    """Shape ``[R]`` [m]."""
-    range_min: float = 0.0
-    """The least valid range [m]."""
-    range_max: float = math.inf
-    """The range up to which it sees [m]."""
-    angle_max: float | None = None
-    """Direction of the last ray [rad]; None: as many increments as there are ranges."""
 
 
 class _Rays(NamedTuple):
@@ -229,7 +204,8 @@ class Sectors:
 
         The last are the distances of the points from the sensor [m].
         """
-        ranges = np.asarray(scan.ranges, dtype=np.float64)
+        scan = in_numbers(scan)
+        ranges = np.asarray(scan.ranges)
         start, step = scan.angle_min, scan.angle_increment
         least, most = scan.range_min, scan.range_max
         if ranges.ndim != 1 or not ranges.size:
