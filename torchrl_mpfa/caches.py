@@ -17,6 +17,8 @@ def own_cache_folder(*inside: str) -> Path | None:
     given = os.environ.get("XDG_CACHE_HOME", "")
     try:
         cache = Path(given) if os.path.isabs(given) else Path.home() / ".cache"
+        if not cache.is_absolute():
+            return None
         folder = cache / "torchrl_mpfa"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         mine = folder.stat().st_uid == os.geteuid()
