@@ -10,6 +10,8 @@ from textwrap import fill
 import pandas as pd
 
 from benchmarks.paper.answers import answers
+from benchmarks.paper.convergence import convergence_table, trained
+from benchmarks.paper.convergence import said as faster
 from benchmarks.paper.failures import (
     PUBLISHED,
     SPLIT,
@@ -18,6 +20,7 @@ from benchmarks.paper.failures import (
     question_table,
 )
 from benchmarks.paper.figures import plot_figures
+from benchmarks.paper.looks import CHANGED, TITLE, looks
 from benchmarks.paper.published import MARK, NAMES, TABLE_2, TABLE_4, TESTS, neighbors
 from benchmarks.paper.rows import QUESTION, Rows, read_rows
 from benchmarks.paper.runs import NEW_SEEDS, comparisons, question
@@ -62,19 +65,28 @@ and claims with {MARK} that rest on them, say nothing about the original. Of MPF
 were filled.
 """
 _ASKED = """
-[The hypothesis, the test and the seeds](study.md#the-papers-question-again) were written down
-before any result of these runs was looked at. The split of the failures was added forty minutes
-later, before any of these rows was kept. Runs are compared unpaired, as planned.
+[The hypothesis, the test and the seeds](study.md#the-papers-question-again) were committed 23
+minutes before the first of these runs was kept, with the promise that none would be looked at
+before all were there. The split of the failures was added 21 minutes after the first run was kept.
+That nobody looked in between is the authors' word. Runs are compared unpaired, as planned.
 """
+_FASTER = (
+    """
+The paper says that training with MPFA-PER converges the fastest, "after 130,000 steps" of Fig. 13,
+and that it is stabler. Its text tests neither. The table has all 46 seeds of three methods, seed by
+seed, and was made after the figures had been seen: it is exploratory. A step is an action. Our runs
+have the paper's 1,000 episodes and end before its 130,000 steps.
+""",
+    """
+No sign was found that MPFA-PER learns faster than PER. In the last world it reaches more goals than
+uniform replay, which is the only difference left after correction. p are of the permutation test of
+signs, first as they are, then corrected together by Holm's method.
+""",
+)
 _BY = {"collisions": "a collision", "out of time": "the time limit"}
 _TEN = """
 Numbers of this table are of the seeds of Tables 2 to 4, ten an arm. [New
 seeds](#does-mpfa-per-fail-less-often-than-per) say more of MPFA-PER, PER and uniform replay.
-"""
-_CHANGED = """
-**Changed after the start.** Failures became the measure beside success after ten seeds were seen.
-Rows were first looked at when the seeds 100 to 104 were made. [Two
-changes](#how-to-read-the-tables) are older.
 """
 _STEPS = f"""
 A step is an action of 0.2 s. Times are those of runs that had the machine to themselves, one after
@@ -92,8 +104,8 @@ planned this arm.
 """
 _LETTER = """
 Closer to the paper (`learner=plain`): without our additions to DDPG, with collisions at 0.35 m from
-the robot's center as in its code base, without mirrored batches, and with noise of one size. There
-are sixteen robots as well.
+the robot's center as in its code base, without mirrored batches, and with noise of one size. Four
+of five tasks have a detour here too, which the paper has not. There are sixteen robots as well.
 """
 _READ = (
     """
@@ -114,8 +126,9 @@ finds with that probability. Its level is 5 % divided by the number of compariso
 """,
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
-changed before any row was looked at. The intervals are Student's in place of a bootstrap's, so that
-other programs compute the same numbers. Arms closer to the paper have five seeds in place of ten.
+changed after the three looks, and before the rows of this page were looked at. The intervals are
+Student's in place of a bootstrap's, so that other programs compute the same numbers. Arms closer to
+the paper have five seeds in place of ten.
 """,
 )
 _MADE = f"""
@@ -168,8 +181,10 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
         else "All planned runs of the tables are made, and their p are final."
     )
     made = answers(rows, found, decided=question_left(asked) == 0)
-    answer = " ".join(filter(None, [said, *(each.said for each in made)]))
-    head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", _CHANGED]
+    training = trained(rows, asked)
+    compared = [faster(training)] if question_left(asked) == 0 else []
+    answer = " ".join(filter(None, [said, *(each.said for each in made), *compared]))
+    head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", CHANGED]
     claims = [list(row) for each in made for row in each.numbers]
     return "\n\n".join(
         [
@@ -181,6 +196,11 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             "## Does MPFA-PER fail less often than PER?",
             _filled(_ASKED),
             *answered,
+            "## Does MPFA-PER learn faster?",
+            *map(_filled, _FASTER),
+            convergence_table(training),
+            f"## {TITLE}",
+            *(text if text.startswith("|") else _filled(text) for text in looks()),
             "## Table 2: parts of the method in the unseen world",
             unseen_table(found, TABLE_2),
             "## Table 3: steps and time of the training",
@@ -204,7 +224,7 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_ROBOTS),
             arms_table(found, OTHER_ARMS["robots"]),
             "## Figures",
-            "No test compares the curves.",
+            "[A table](#does-mpfa-per-learn-faster) compares the training of three of the methods.",
             *pictured,
             "## How to read the tables",
             *map(_filled, _READ),
