@@ -162,7 +162,7 @@ def plot_cliffwalk(path: Path) -> None:
 
 def plot_mujoco(path: Path) -> None:
     """Plot the scores of each task of MuJoCo over the steps."""
-    plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path, columns=1)
+    plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path)
 
 
 def plot_sparse(path: Path) -> None:

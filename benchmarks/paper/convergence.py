@@ -16,7 +16,7 @@ from training.statistics import holm, mean_interval, permuted_difference
 
 LAST_WORLD = "D"
 _LEVEL = 0.05
-_FORMS = {
+MEASURES = {
     "success in training": "{:.1%}",
     f"success in training, world {LAST_WORLD}": "{:.1%}",
     "area of success in validation": "{:.3f}",
@@ -54,13 +54,13 @@ def _measured(
         episodes["reward"].sum() / episodes["steps"].sum(),
         episodes["total_steps"].iloc[-1],
     )
-    return dict(zip(_FORMS, map(float, values), strict=True))
+    return dict(zip(MEASURES, map(float, values), strict=True))
 
 
 def compare(found: Trained) -> dict[tuple[str, str], tuple[float, float]]:
     """Return p of MPFA-PER beside the others, by measure: as it is, and corrected for all."""
     ours, *others = CLAIMS
-    pairs = [(measure, other) for measure in _FORMS for other in others]
+    pairs = [(measure, other) for measure in MEASURES for other in others]
     ps = []
     for measure, other in pairs:
         sides = [
@@ -76,7 +76,7 @@ def said(found: Trained) -> str:
     seeds = len(found[CLAIMS[0]])
     parts = []
     for other in CLAIMS[1:]:
-        differ = [measure for measure in _FORMS if corrected[measure, other] < _LEVEL]
+        differ = [measure for measure in MEASURES if corrected[measure, other] < _LEVEL]
         which = f"a difference in {' and '.join(differ)}" if differ else "no difference"
         parts.append(f"{which} to {NAMES[other]}")
     return f"In the training of {seeds} seeds MPFA-PER shows {' and '.join(parts)} (exploratory)."
@@ -86,7 +86,7 @@ def convergence_table(found: Trained) -> str:
     """Return means with intervals, and p of MPFA-PER beside the others."""
     ps, others = compare(found), CLAIMS[1:]
     lines = []
-    for measure, form in _FORMS.items():
+    for measure, form in MEASURES.items():
         cells = [measure]
         for name in CLAIMS:
             mean = mean_interval(found[name][measure].to_numpy(dtype=float))
