@@ -12,6 +12,7 @@ import pandas as pd
 from benchmarks.paper.answers import answers
 from benchmarks.paper.convergence import convergence_table, trained
 from benchmarks.paper.convergence import said as faster
+from benchmarks.paper.errors import errors_table
 from benchmarks.paper.failures import (
     PUBLISHED,
     SPLIT,
@@ -41,6 +42,7 @@ _WIDTH = 120
 _CAPTION = "Mean over runs and its 95 % interval; in brackets the number of runs."
 _MARKED = f"{MARK}: [our reconstruction](../methods/README.md#all-methods) of a method of others."
 _FIGURES = {
+    3: "Fig. 3: TD error and reward per step of DDPG with PER in map A",
     5: "Fig. 5: reward per step in map A with MPFA-PER and φ = 2, 3 and 4",
     8: "Fig. 8: reward per step with parts of the priority",
     9: "Fig. 9: reward per step with the raise of positive transitions",
@@ -83,6 +85,11 @@ uniform replay, which is the only difference left after correction. p are of the
 signs, first as they are, then corrected together by Holm's method.
 """,
 )
+_ERRORS = """
+In the paper's Fig. 3 the TD error of PER rises after 80 episodes, and the reward per step stays
+near 0.5. Ours has ten seeds, made after the other figures were seen. p are of the signs, and not
+corrected:
+"""
 _BY = {"collisions": "a collision", "out of time": "the time limit"}
 _TEN = """
 Numbers of this table are of the seeds of Tables 2 to 4, ten an arm. [New
@@ -132,15 +139,17 @@ the paper have five seeds in place of ten.
 """,
 )
 _MADE = f"""
-Every run was trained and tested at commit {COMMIT}, one thread each. A run takes 4 to 12 minutes.
+Every run was trained and tested at commit {COMMIT}, those of Fig. 3 at 19746a0f, one thread each. A
+run takes 4 to 12 minutes.
 Another kind of processor rounds differently. So its run of the same seed is another run from the
 first update on. The commands below make runs of the same settings with the code of this version.
 The first one continues where it was stopped. The second one makes the runs of Table 3's times, one
-at a time. The third one writes this page from their rows.
+at a time, and the third one those of Fig. 3. The last one writes this page from their rows.
 """
 _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
     python -m benchmarks.paper time --folder runs/paper
+    python -m benchmarks.paper figure3 --folder runs/paper
     make paper ARGS='--rows runs/paper/rows --output runs/paper'"""
 _KEPT = "`make paper` alone writes it from [the rows that are kept](paper):"
 _FILES = [
@@ -148,6 +157,7 @@ _FILES = [
     ["`curves.csv.gz`", "an evaluation during training"],
     ["`episodes/RUN.csv.gz`", "a training episode"],
     ["`question`", "a folder: the same of the runs that test whether MPFA-PER fails less often"],
+    ["`figure_3.csv.gz`", "a TD error or a reward of an episode of Fig. 3"],
     ["`times.csv`", "training time of a run that had the machine to itself [min]"],
 ]
 
@@ -226,6 +236,9 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             "## Figures",
             "[A table](#does-mpfa-per-learn-faster) compares the training of three of the methods.",
             *pictured,
+            *filter(
+                None, [errors_table(rows.folder) and _filled(_ERRORS), errors_table(rows.folder)]
+            ),
             "## How to read the tables",
             *map(_filled, _READ),
             "## How the rows were made",
