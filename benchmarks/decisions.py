@@ -4,7 +4,8 @@
     python -m benchmarks.decisions --kept    print the table of the kept rows
 
 A row is a drive in world D on exact arcs: the mean CPU time of its decisions, behind the filter. A
-network decides for all robots in one call, whose time is divided by their number.
+network decides for all robots in one call, whose time is divided by their number. The drivers take
+turns, as the speed of a machine changes with what else it does.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from __future__ import annotations
 import argparse
 import inspect
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
 
-from mpfa_envs import TaskConfig, evaluate, load_policy, make_planner
-from mpfa_envs.evaluation.runs import Driver, Filtered
+from mpfa_envs import TaskConfig, evaluate, load_policy
+from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.planners import PredictiveControl
 from training.comparison.report import table
 from training.files import run_script
 from training.records import read_table, write_table
@@ -28,13 +31,14 @@ PLANNER = "mpc"
 ROBOTS = (1, 16)
 """Robots at once."""
 DRIVES = 16
+ROUNDS = 5
 _FIELDS = set(inspect.signature(TaskConfig).parameters)
 
 
-def make_driver(name: str) -> Driver:
+def make_driver(name: str) -> PredictiveControl | Filtered:
     """Make predictive control, which has the filter, or a policy of the package behind it."""
     if name == PLANNER:
-        return make_planner(PLANNER, robot="kobuki")
+        return PredictiveControl(robot="kobuki")
     policy = load_policy(name)
     arguments = {key: value for key, value in policy.env_arguments.items() if key in _FIELDS}
     return Filtered(policy, TaskConfig(**arguments).make_filter())
@@ -43,17 +47,15 @@ def make_driver(name: str) -> Driver:
 def measure() -> pd.DataFrame:
     """Drive with all drivers; return a row for each drive."""
     rows = []
-    for name in (*POLICIES, PLANNER):
-        # What is compiled is loaded before the first drive that counts.
+    names = (*POLICIES, PLANNER)
+    for name in names:  # What is compiled is loaded before the first drive that counts.
         evaluate(make_driver(name), "D", episodes=1, physics="kinematic")
-        for robots in ROBOTS:
-            driver = make_driver(name)
-            drives = evaluate(
-                driver, "D", episodes=DRIVES, envs_at_once=robots, physics="kinematic"
-            )
-            for number, drive in enumerate(drives):
-                rows.append((name, robots, number, round(1000.0 * drive.decision_s, 4)))
-    return pd.DataFrame(rows, columns=["driver", "robots", "drive", "decision_ms"])
+    for turn, robots, name in product(range(ROUNDS), ROBOTS, names):
+        driver = make_driver(name)
+        drives = evaluate(driver, "D", episodes=DRIVES, envs_at_once=robots, physics="kinematic")
+        for number, drive in enumerate(drives):
+            rows.append((name, robots, turn, number, round(1000.0 * drive.decision_s, 4)))
+    return pd.DataFrame(rows, columns=["driver", "robots", "round", "drive", "decision_ms"])
 
 
 def decision_table(path: Path = KEPT) -> str:
