@@ -65,6 +65,7 @@ METHODS = {
     "PER": ("per", 0),
     "MPFA-PER": ("mpfa_per", 0),
     "uniform": ("uniform", 0),
+    "half batches with hindsight": ("uniform_halves", 4),
 }
 """Method and goals in hindsight for each transition."""
 _OF_REGIME = {"charged": 3, "near goals": 6, "carried out": 1, "simple": 1, "before": 1}
@@ -100,8 +101,8 @@ def folder_of(arm: str, folder: Path) -> Path:
 
 
 def make(arm: str, folder: Path, seeds: Sequence[int], jobs: int) -> int:
-    """Train and evaluate the runs of an arm; return the exit status."""
-    regime, name = ARMS[arm]
+    """Train and evaluate the runs of an arm, REGIME: METHOD; return the exit status."""
+    regime, name = arm.split(": ")
     method, goals = METHODS[name]
     words = (*SETTINGS, *REGIMES[regime], f"method.hindsight={goals}")
     judged = Evaluation(WORLDS, episodes=_EPISODES, physics="kinematic")
@@ -111,19 +112,19 @@ def make(arm: str, folder: Path, seeds: Sequence[int], jobs: int) -> int:
 
 
 def rows_of(arm: str, folder: Path) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of the runs of an arm."""
-    regime, name = ARMS[arm]
-    for run in sorted(folder_of(arm, folder).glob("*/evaluations.csv")):
-        seed = run.parent.name.rsplit("-", 1)[1]
-        found = read_table(run)
-        for steps, success in zip(found["total_steps"], found["success"], strict=True):
-            yield f"{regime}, validation", name, seed, steps, success
+    """Yield the rows of the evaluated runs of an arm."""
+    regime, name = arm.split(": ")
     tests = read_table(folder_of(arm, folder) / files.EPISODES)
+    runs = {str(seed): [*folder_of(arm, folder).glob(f"*-{seed}")] for seed in tests["seed"]}
+    for seed, [run] in runs.items():
+        curve = read_table(run / files.EVALUATIONS)
+        for steps, success in zip(curve["total_steps"], curve["success"], strict=True):
+            yield f"{regime}, validation", name, seed, steps, success
     kinds = tests["world"].map(family)
     of_kind = tests["success"].groupby([tests["seed"], kinds]).mean().unstack()
-    for run in sorted(folder_of(arm, folder).glob("*/policy.npz")):
-        seed = run.parent.name.rsplit("-", 1)[1]
-        yield f"{regime}, changed", name, seed, ACTIONS, changed_share(load_policy(run))
+    for seed, [run] in runs.items():
+        changed = changed_share(load_policy(run / files.POLICY))
+        yield f"{regime}, changed", name, seed, ACTIONS, changed
     for number, success in of_kind.iterrows():
         mazes = success.pop("mazes:test")
         yield f"{regime}, test", name, number, ACTIONS, success.mean()

@@ -165,6 +165,12 @@ def plot_mujoco(path: Path) -> None:
     plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path, columns=1)
 
 
+def plot_half_cheetah(path: Path) -> None:
+    """Plot the scores of the only task of MuJoCo that so few steps are enough for."""
+    name = "HalfCheetah-v5"
+    plot_scores({name: runs_by_task([KEPT / "mujoco.csv"])[name]}, path)
+
+
 def plot_sparse(path: Path) -> None:
     """Plot success in validation worlds of sparse rewards: near goals, simple, before."""
     tasks = runs_by_task([KEPT / "sparse.csv"])
@@ -182,7 +188,12 @@ def plot_sparse(path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the pictures that are asked for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.study", description=__doc__)
-    images = {"cliffwalk": plot_cliffwalk, "mujoco": plot_mujoco, "sparse": plot_sparse}
+    images = {
+        "cliffwalk": plot_cliffwalk,
+        "mujoco": plot_mujoco,
+        "half_cheetah": plot_half_cheetah,
+        "sparse": plot_sparse,
+    }
     known = [*PANELS, *images]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"among {', '.join(known)}")
     parser.add_argument("--output", type=Path, default=None, help="folder")

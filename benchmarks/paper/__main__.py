@@ -3,6 +3,7 @@
     python -m benchmarks.paper                 write docs/results/paper.md from the kept rows
     python -m benchmarks.paper run             make the runs that have no rows yet; thirteen hours
     python -m benchmarks.paper time            make the runs of Table 3's times, one at a time
+    python -m benchmarks.paper figure3         make the runs of Fig. 3; half an hour
     python -m benchmarks.paper keep            add the rows of finished runs, and make none
 
 Ctrl-C saves the runs in progress, and the same command continues them. ``run`` and ``time`` add
@@ -19,6 +20,7 @@ from pathlib import Path
 import training.extra  # noqa: F401
 
 # isort: split
+from benchmarks.paper.errors import figure_3, keep_figure_3
 from benchmarks.paper.page import write_page
 from benchmarks.paper.published import TABLE_3
 from benchmarks.paper.rows import FOLDER, QUESTION, keep, keep_time, read_rows
@@ -40,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "command", nargs="?", default="page", choices=["page", "run", "time", "keep"]
+        "command", nargs="?", default="page", choices=["page", "run", "time", "figure3", "keep"]
     )
     parser.add_argument(
         "--folder", type=Path, default=Path("runs/paper"), help="of runs (default: runs/paper)"
@@ -59,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == "keep":
             return _keep(options.folder, rows)
         register()
-        make = _time if options.command == "time" else _make
+        make = {"time": _time, "figure3": _figure_3}.get(options.command, _make)
         return make(options.folder, rows, options.jobs)
     except (ValueError, files.FolderInUse) as error:
         parser.error(" ".join(str(error).split()))
@@ -93,6 +95,14 @@ def _make(folder: Path, rows: Path, jobs: int) -> int:
             if worst >= 128:
                 return worst
     return worst
+
+
+def _figure_3(folder: Path, rows: Path, jobs: int) -> int:
+    """Make the runs of Fig. 3, and keep their rows."""
+    planned = figure_3(folder)
+    status = make_runs(planned, most=jobs)
+    print(f"kept: {keep_figure_3(planned, rows)} runs")
+    return status
 
 
 def _time(folder: Path, rows: Path, _: int) -> int:

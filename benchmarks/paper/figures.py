@@ -1,4 +1,4 @@
-"""The paper's Figures 5, 8 to 11 and 13 from kept rows: mean over runs and its 95 % interval."""
+"""The paper's Figures 3, 5, 8 to 11 and 13 from kept rows: mean over runs and its 95 % interval."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchmarks.paper.errors import plot_figure_3
 from benchmarks.paper.published import CURVES, NAMES, PHIS, TABLE_4
 from benchmarks.paper.rows import Rows
 from mpfa_envs.render.charts import Curve, draw_seeds, finish, new_figure
@@ -27,9 +28,11 @@ _METHODS = {name: method for method, name in NAMES.items()}
 def plot_figures(rows: Rows, folder: Path) -> list[Path]:
     """Plot the figures that have runs; return their files."""
     made = []
-    for number in (5, *CURVES, 13):
+    for number in (3, 5, *CURVES, 13):
         path = folder / f"figure_{number}.png"
-        if number in CURVES:
+        if number == 3:
+            drawn = plot_figure_3(rows.folder, path)
+        elif number in CURVES:
             drawn = plot_rewards_by_map(rows, CURVES[number], path)
         else:
             drawn = (plot_figure_5 if number == 5 else plot_figure_13)(rows, path)

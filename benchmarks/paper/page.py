@@ -10,6 +10,9 @@ from textwrap import fill
 import pandas as pd
 
 from benchmarks.paper.answers import answers
+from benchmarks.paper.convergence import convergence_table, trained
+from benchmarks.paper.convergence import said as faster
+from benchmarks.paper.errors import errors_table
 from benchmarks.paper.failures import (
     PUBLISHED,
     SPLIT,
@@ -18,6 +21,7 @@ from benchmarks.paper.failures import (
     question_table,
 )
 from benchmarks.paper.figures import plot_figures
+from benchmarks.paper.looks import CHANGED, TITLE, looks
 from benchmarks.paper.published import MARK, NAMES, TABLE_2, TABLE_4, TESTS, neighbors
 from benchmarks.paper.rows import QUESTION, Rows, read_rows
 from benchmarks.paper.runs import NEW_SEEDS, comparisons, question
@@ -38,6 +42,7 @@ _WIDTH = 120
 _CAPTION = "Mean over runs and its 95 % interval; in brackets the number of runs."
 _MARKED = f"{MARK}: [our reconstruction](../methods/README.md#all-methods) of a method of others."
 _FIGURES = {
+    3: "Fig. 3: TD error and reward per step of DDPG with PER in map A",
     5: "Fig. 5: reward per step in map A with MPFA-PER and φ = 2, 3 and 4",
     8: "Fig. 8: reward per step with parts of the priority",
     9: "Fig. 9: reward per step with the raise of positive transitions",
@@ -62,19 +67,33 @@ and claims with {MARK} that rest on them, say nothing about the original. Of MPF
 were filled.
 """
 _ASKED = """
-[The hypothesis, the test and the seeds](study.md#the-papers-question-again) were written down
-before any result of these runs was looked at. The split of the failures was added forty minutes
-later, before any of these rows was kept. Runs are compared unpaired, as planned.
+[The hypothesis, the test and the seeds](study.md#the-papers-question-again) were committed 23
+minutes before the first of these runs was kept, with the promise that none would be looked at
+before all were there. The split of the failures was added 21 minutes after the first run was kept.
+That nobody looked in between is the authors' word. Runs are compared unpaired, as planned.
+"""
+_FASTER = (
+    """
+The paper says that training with MPFA-PER converges the fastest, "after 130,000 steps" of Fig. 13,
+and that it is stabler. Its text tests neither. The table has all 46 seeds of three methods, seed by
+seed, and was made after the figures had been seen: it is exploratory. A step is an action. Our runs
+have the paper's 1,000 episodes and end before its 130,000 steps.
+""",
+    """
+No sign was found that MPFA-PER learns faster than PER. In the last world it reaches more goals than
+uniform replay, which is the only difference left after correction. p are of the permutation test of
+signs, first as they are, then corrected together by Holm's method.
+""",
+)
+_ERRORS = """
+In the paper's Fig. 3 the TD error of PER rises after 80 episodes, and the reward per step stays
+near 0.5. Ours has ten seeds, made after the other figures were seen. p are of the signs, and not
+corrected:
 """
 _BY = {"collisions": "a collision", "out of time": "the time limit"}
 _TEN = """
 Numbers of this table are of the seeds of Tables 2 to 4, ten an arm. [New
 seeds](#does-mpfa-per-fail-less-often-than-per) say more of MPFA-PER, PER and uniform replay.
-"""
-_CHANGED = """
-**Changed after the start.** Failures became the measure beside success after ten seeds were seen.
-Rows were first looked at when the seeds 100 to 104 were made. [Two
-changes](#how-to-read-the-tables) are older.
 """
 _STEPS = f"""
 A step is an action of 0.2 s. Times are those of runs that had the machine to themselves, one after
@@ -92,8 +111,8 @@ planned this arm.
 """
 _LETTER = """
 Closer to the paper (`learner=plain`): without our additions to DDPG, with collisions at 0.35 m from
-the robot's center as in its code base, without mirrored batches, and with noise of one size. There
-are sixteen robots as well.
+the robot's center as in its code base, without mirrored batches, and with noise of one size. Four
+of five tasks have a detour here too, which the paper has not. There are sixteen robots as well.
 """
 _READ = (
     """
@@ -114,20 +133,23 @@ finds with that probability. Its level is 5 % divided by the number of compariso
 """,
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
-changed before any row was looked at. The intervals are Student's in place of a bootstrap's, so that
-other programs compute the same numbers. Arms closer to the paper have five seeds in place of ten.
+changed after the three looks, and before the rows of this page were looked at. The intervals are
+Student's in place of a bootstrap's, so that other programs compute the same numbers. Arms closer to
+the paper have five seeds in place of ten.
 """,
 )
 _MADE = f"""
-Every run was trained and tested at commit {COMMIT}, one thread each. A run takes 4 to 12 minutes.
+Every run was trained and tested at commit {COMMIT}, those of Fig. 3 at 19746a0f, one thread each. A
+run takes 4 to 12 minutes.
 Another kind of processor rounds differently. So its run of the same seed is another run from the
 first update on. The commands below make runs of the same settings with the code of this version.
 The first one continues where it was stopped. The second one makes the runs of Table 3's times, one
-at a time. The third one writes this page from their rows.
+at a time, and the third one those of Fig. 3. The last one writes this page from their rows.
 """
 _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
     python -m benchmarks.paper time --folder runs/paper
+    python -m benchmarks.paper figure3 --folder runs/paper
     make paper ARGS='--rows runs/paper/rows --output runs/paper'"""
 _KEPT = "`make paper` alone writes it from [the rows that are kept](paper):"
 _FILES = [
@@ -135,6 +157,7 @@ _FILES = [
     ["`curves.csv.gz`", "an evaluation during training"],
     ["`episodes/RUN.csv.gz`", "a training episode"],
     ["`question`", "a folder: the same of the runs that test whether MPFA-PER fails less often"],
+    ["`figure_3.csv.gz`", "a TD error or a reward of an episode of Fig. 3"],
     ["`times.csv`", "training time of a run that had the machine to itself [min]"],
 ]
 
@@ -168,8 +191,10 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
         else "All planned runs of the tables are made, and their p are final."
     )
     made = answers(rows, found, decided=question_left(asked) == 0)
-    answer = " ".join(filter(None, [said, *(each.said for each in made)]))
-    head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", _CHANGED]
+    training = trained(rows, asked)
+    compared = [faster(training)] if question_left(asked) == 0 else []
+    answer = " ".join(filter(None, [said, *(each.said for each in made), *compared]))
+    head = [_QUESTION, f"**Answer.** {answer}", f"**How sure.** {sure} {_WORLDS}", CHANGED]
     claims = [list(row) for each in made for row in each.numbers]
     return "\n\n".join(
         [
@@ -181,6 +206,11 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             "## Does MPFA-PER fail less often than PER?",
             _filled(_ASKED),
             *answered,
+            "## Does MPFA-PER learn faster?",
+            *map(_filled, _FASTER),
+            convergence_table(training),
+            f"## {TITLE}",
+            *(text if text.startswith("|") else _filled(text) for text in looks()),
             "## Table 2: parts of the method in the unseen world",
             unseen_table(found, TABLE_2),
             "## Table 3: steps and time of the training",
@@ -204,8 +234,11 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_ROBOTS),
             arms_table(found, OTHER_ARMS["robots"]),
             "## Figures",
-            "No test compares the curves.",
+            "[A table](#does-mpfa-per-learn-faster) compares the training of three of the methods.",
             *pictured,
+            *filter(
+                None, [errors_table(rows.folder) and _filled(_ERRORS), errors_table(rows.folder)]
+            ),
             "## How to read the tables",
             *map(_filled, _READ),
             "## How the rows were made",

@@ -88,12 +88,12 @@ def keep(planned: Iterable[Comparison], folder: Path) -> list[str]:
         ):
             tables.append(read_table(path).assign(arm=arm_of(job), seed=job.seed)[columns])
         trained = read_table(job.path / files.EPISODES)
-        _write(trained[EPISODES], _episodes_file(folder, job.name))
+        write_rows(trained[EPISODES], _episodes_file(folder, job.name))
     if new:
         # The tests say which runs there are: they are written last.
         for name, tables in (("curves", curves), ("tests", tests)):
             table = pd.concat([each for each in tables if len(each)])
-            _write(table.sort_values(RUN, kind="stable"), folder / f"{name}.csv.gz")
+            write_rows(table.sort_values(RUN, kind="stable"), folder / f"{name}.csv.gz")
     return [job.name for _, job in new]
 
 
@@ -104,7 +104,7 @@ def keep_time(job: Job, folder: Path) -> None:
     row = pd.DataFrame([[arm_of(job), job.seed, seconds / 60]], columns=TIMES)
     there = read_rows(folder).times
     table = pd.concat([there, row]) if len(there) else row
-    _write(table.drop_duplicates(RUN, keep="last").sort_values(RUN), folder / "times.csv")
+    write_rows(table.drop_duplicates(RUN, keep="last").sort_values(RUN), folder / "times.csv")
 
 
 def arm_of(job: Job) -> str:
@@ -117,7 +117,7 @@ def _episodes_file(folder: Path, run: str) -> Path:
     return folder / "episodes" / f"{run}.csv.gz"
 
 
-def _write(table: pd.DataFrame, path: Path) -> None:
+def write_rows(table: pd.DataFrame, path: Path) -> None:
     """Write a table in one step, the same bytes for the same rows."""
     flags = table.select_dtypes(bool).columns
     text = table.astype(dict.fromkeys(flags, int)).round(_DIGITS).to_csv(index=False)

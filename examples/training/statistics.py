@@ -19,8 +19,9 @@ from mpfa_envs.evaluation.results import Interval
 
 Array = NDArray[np.float64]
 _PERMUTATIONS = 50_000
-"""Permutations: all of them up to nine runs against nine or fifteen pairs, else a sample."""
-
+"""Permutations of runs: all of them up to nine runs against nine, else a sample."""
+_EXACT = 20
+"""Most pairs of which all permutations of signs are counted: a million."""
 
 FEWEST = 3
 """Fewest runs with an interval: that of two runs would be 13 times as wide as their distance."""
@@ -88,6 +89,13 @@ def sign_p(gaps: Array) -> float:
     """
     if len(gaps) == 1:
         return 1.0
+    if len(gaps) <= _EXACT:
+        sums = np.zeros(1)
+        for gap in gaps:
+            sums = np.concatenate([sums - gap, sums + gap])
+        # What is equal but for rounding counts as equal.
+        sizes = abs(sums / len(gaps)).round(12)
+        return float((sizes >= abs(gaps.mean()).round(12)).mean())
 
     def size(x: Array, axis: int) -> Array:
         return np.asarray(abs(x.mean(axis=axis)).round(12))

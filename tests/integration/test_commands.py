@@ -27,7 +27,8 @@ import torchrl_maddpg
 import torchrl_sac
 import torchrl_trainer
 import tune
-from benchmarks import drivers, pictures, sampling, stops
+from benchmarks import drivers, pictures, rivals, sampling, stops
+from benchmarks.late import __main__ as late
 from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, worlds
 from benchmarks.values import __main__ as values
@@ -70,7 +71,9 @@ MAINS: dict[str, Callable[[], object]] = {
     "benchmarks.paper": paper.main,
     "benchmarks.stops": stops.main,
     "benchmarks.drivers": drivers.main,
+    "benchmarks.late": late.main,
     "benchmarks.pictures": pictures.main,
+    "benchmarks.rivals": rivals.main,
     "benchmarks.sampling": sampling.main,
 }
 

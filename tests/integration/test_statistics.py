@@ -41,7 +41,7 @@ def test_intervals_of_one_run_have_no_ends() -> None:
         assert np.isnan([found.low, found.high]).all()
 
 
-@pytest.mark.parametrize("seeds", [1, 4, 9])
+@pytest.mark.parametrize("seeds", [1, 4, 9, 16])
 def test_sign_p_is_the_share_of_all_signs_with_as_large_a_mean(seeds: int) -> None:
     gaps = np.random.default_rng(seeds).normal(0.5, 1.0, seeds)
     means = [abs(np.mean(signs * gaps)) for signs in product([-1, 1], repeat=seeds)]

@@ -256,7 +256,17 @@ def number(value: float, *, sign: bool = False) -> str:
 
 def _p(corrected: float, least: float) -> str:
     """Return p, and the least that so few runs can have where no difference could be found."""
-    return f"{corrected:.3f}" + (f" (least {least:.3f})" if least > 0.05 else "")
+    return p_text(corrected) + (f" (least {least:.3f})" if least > 0.05 else "")
+
+
+def p_text(p: float) -> str:
+    """Return p with three decimals, never as zero.
+
+    Examples:
+        >>> p_text(0.0004), p_text(0.0412)
+        ('< 0.001', '0.041')
+    """
+    return "< 0.001" if p < 0.0005 else f"{p:.3f}"
 
 
 def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:

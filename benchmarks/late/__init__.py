@@ -1,0 +1,1 @@
+"""A bench for policies on a robot whose orders are late; it shares no code with the simulator."""

@@ -1,0 +1,64 @@
+"""Actions of 0.2 and 0.4 s: settings of the runs, rows that are kept, measures of rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks import durations
+from benchmarks.paper.rows import write_rows
+from training.settings.train import TrainSettings, register
+
+
+def settings_of(arm: str) -> TrainSettings:
+    """Settings of the first run of an arm."""
+    planned = durations.comparison(Path("runs"), (640,))
+    register()
+    job = next(job for job in planned.jobs if job.arm.name == arm)
+    return job.asked(planned.settings)
+
+
+@pytest.mark.parametrize("arm", ["long", "near"])
+def test_longer_actions_have_equal_seconds_updates_and_evaluations(arm: str) -> None:
+    short, longer = settings_of("short"), settings_of(arm)
+    [first], [second] = short.curriculum.stages, longer.curriculum.stages
+    assert longer.environment.action_repeat == 4 and first.actions == 2 * second.actions
+    assert first.actions * short.updates == second.actions * longer.updates
+    assert short.evaluation.every == 2 * longer.evaluation.every
+    assert short.exploration.random_steps == 2 * longer.exploration.random_steps
+    assert short.exploration.annealing_steps == 2 * longer.exploration.annealing_steps
+    assert longer.learner.gamma == pytest.approx({"long": 0.95, "near": 0.95**2}[arm])
+
+
+def write_tests(folder: Path, times: dict[str, list[float]]) -> None:
+    """Rows of one seed of each arm: two rooms and a maze that the planner does not reach."""
+    tasks = [("rooms-test-0", 0), ("rooms-test-1", 0), ("mazes-test-0", 0), ("mazes-test-1", 0)]
+    tables = []
+    for arm, of_arm in times.items():
+        table = pd.DataFrame(tasks, columns=["world", "episode"])
+        table["time_s"], table["arm"], table["seed"] = of_arm, arm, 640
+        table["success"] = [1, 1, 1, int(arm != "mpc")]
+        table["collision"] = 0
+        tables.append(table[durations.TESTS])
+    write_rows(pd.concat(tables[:-1]), folder / "tests.csv.gz")
+    write_rows(tables[-1], folder / "planner.csv.gz")
+
+
+def test_time_over_planner_counts_kinds_alike_and_tasks_that_both_reach(tmp_path: Path) -> None:
+    arms = {
+        "td3-mpfa_per-short": [20.0, 10.0, 30.0, 9.0],
+        "td3-mpfa_per-long": [10.0, 10.0, 15.0, 9.0],
+        "mpc": [10.0, 10.0, 15.0, 99.0],
+    }
+    write_tests(tmp_path, arms)
+    tests, planner = (pd.read_csv(tmp_path / f"{name}.csv.gz") for name in ("tests", "planner"))
+    found = durations.measures(tests, planner).set_index("arm")
+    assert found["time"]["td3-mpfa_per-long"] == pytest.approx(1.0)
+    # Rooms: the root of 2 and 1; mazes: 2.
+    assert found["time"]["td3-mpfa_per-short"] == pytest.approx(np.sqrt(np.sqrt(2.0) * 2.0))
+    assert found["success"]["td3-mpfa_per-short"] == 1.0
+    [outcomes, title, _] = durations.tables(tmp_path)[:3]
+    assert "| TD3 | 0.4 s | 1 | 100.00% |" in outcomes and title == "### TD3"
