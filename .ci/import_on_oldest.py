@@ -13,7 +13,7 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = {"torchrl_mpfa": ROOT, "mpfa_envs": ROOT / "envs"}
@@ -39,7 +39,7 @@ class _Kind(type):
     def __getitem__(cls, key: Any) -> Any:
         return cls
 
-    def __or__(cls, other: Any) -> Any:  # type: ignore[override]
+    def __or__(cls, other: Any) -> Any:
         return cls
 
     __ror__ = __or__
@@ -74,7 +74,7 @@ class _Kind(type):
 class _MadeUp(ModuleType):
     """Module that has every name."""
 
-    __path__: list[str] = []
+    __path__: ClassVar[list[str]] = []
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name.endswith("__"):
