@@ -13,7 +13,7 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = {"torchrl_mpfa": ROOT, "mpfa_envs": ROOT / "envs"}
@@ -73,8 +73,6 @@ class _Kind(type):
 
 class _MadeUp(ModuleType):
     """Module that has every name."""
-
-    __path__: ClassVar[list[str]] = []
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name.endswith("__"):
