@@ -57,6 +57,7 @@ def test_start_below_a_batch_is_rejected(capsys: pytest.CaptureFixture[str]) -> 
     assert "--start must be at least one batch of 100, got 99" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:none of the .* rewards in the buffer are above")
 def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     short = ["--task", "Pendulum-v1", "--steps", "200", "--start", "150", "--every", "200"]
     command = [*short, "--folder", str(tmp_path)]

@@ -154,13 +154,3 @@ def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
 @pytest.mark.parametrize("name", ["uniform", "pal", "cer"])
 def test_annealing_without_priorities_does_nothing(name):
     make_replay(name, capacity=100).anneal(1.0)
-
-
-def test_method_with_a_hook_of_0_4_that_nothing_calls_is_rejected():
-    with pytest.raises(
-        TypeError, match=r"Old.kept_signals is not called since 0.5: name .* in KEPT"
-    ):
-
-        class Old(Method):
-            def kept_signals(self):
-                return []

@@ -131,11 +131,6 @@ ROWS = [
         for kind in (SignalTensorStorage, SignalMemmapStorage)
         for size in (0, -1, True, 2.5, 2**31)
     ],
-    *[
-        (kind, {"max_size": 4, name: value}, rf"{name} is no argument of a storage since 0\.5: ")
-        for kind in (SignalTensorStorage, SignalMemmapStorage)
-        for name, value in {"signals": ["td_error"], "reward_key": "r"}.items()
-    ],
     (Signal, {"name": ""}, "name must not be empty"),
     (
         Signal,

@@ -80,13 +80,6 @@ class Method:
     curiosity = 0.0
     """Factor of the bonus for outcomes that the robot could not predict (ICM); 0: none."""
 
-    def __init_subclass__(cls) -> None:
-        if "kept_signals" in vars(cls):
-            raise TypeError(
-                f"{cls.__name__}.kept_signals is not called since 0.5: name the signals in KEPT of "
-                "the sampler's class"
-            )
-
     def __post_init__(self) -> None:
         keep(self, **rules_of(type(self)))
 

@@ -32,12 +32,6 @@ from torchrl_mpfa.storages.schema import Schema, as_index
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
 
-_MOVED = {
-    "signals": "the sampler alone knows its signals",
-    "reward_key": "give it to the sampler",
-    "allow_nonfinite": "give it to SignalReplayBuffer",
-}
-
 
 class SignalTensorStorage(LazyTensorStorage):
     """:class:`~torchrl.data.LazyTensorStorage` that is faster, and holds the signals of a sampler.
@@ -52,7 +46,6 @@ class SignalTensorStorage(LazyTensorStorage):
             environments, as in TorchRL, and ``max_size`` must be a multiple of their number.
 
     Raises:
-        TypeError: If an argument belongs to sampler or buffer.
         ValueError: If ``max_size`` is not positive.
 
     Examples:
@@ -69,8 +62,6 @@ class SignalTensorStorage(LazyTensorStorage):
 
     def __init__(self, max_size: int, **kwargs: Any) -> None:
         max_size = check_counts(max_size=max_size)
-        for name in _MOVED.keys() & kwargs.keys():
-            raise TypeError(f"{name} is no argument of a storage since 0.5: {_MOVED[name]}")
         super().__init__(max_size, **kwargs)
 
     def hold(self, table: SignalTable) -> None:

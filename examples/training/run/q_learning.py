@@ -165,7 +165,8 @@ class TabularQLearner:
         self._rate = self._first_rate * check(SHARE, factor=factor)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the table and the count."""
+        """Return the table and the count, or raise ``ValueError`` if a value is not finite."""
+        check_saved_numbers("learner", {"table": self.table})
         return {"networks": {"table": self.table.clone()}, "updates": self.updates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
