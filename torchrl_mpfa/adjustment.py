@@ -8,14 +8,15 @@ https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, Rule, keep
+from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, Rule, keep, kind_of
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -191,6 +192,14 @@ class Adjustment:
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
         raise NotImplementedError(f"{type(self).__name__} must have a method __call__()")
+
+
+def check_adjustments(adjustments: Any) -> None:
+    """Reject anything but a list of adjustments."""
+    listed = isinstance(adjustments, Sequence)
+    if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
+        kinds = ", ".join(map(kind_of, adjustments)) if listed else kind_of(adjustments)
+        raise TypeError(f"adjustments must be a list of torchrl_mpfa.Adjustment, got {kinds}")
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from torchrl_mpfa.samplers.composition import distributions
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
-from torchrl_mpfa.storages.schema import as_integers, as_path, check_finite_entries
-from torchrl_mpfa.storages.tensor import SignalTensorStorage
+from torchrl_mpfa.storages.schema import as_integers, as_path
+from torchrl_mpfa.storages.tensor import rows_with
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
 _MISSING = (
@@ -176,7 +176,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             with self._replay_lock, self._write_lock:
                 index, info = self._sampler.sample(self._storage, batch_size)
                 info["index"] = index
-                data, rest = self._rows_with(index, info)
+                data, rest = rows_with(self._storage, index, info)
                 data = self._collate_fn(data)
         # Written here, where the batch is made: afterwards TorchRL's buffer would move each
         # entry to the device that it is on already, at a tenth of the cost of the whole call.
@@ -185,21 +185,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 for key, value in rest.items():
                     data.set(key, torch.stack(value, -1) if isinstance(value, tuple) else value)
         return data, info
-
-    def _rows_with(self, index: Any, info: dict[Any, Any]) -> tuple[Any, dict[Any, Any]]:
-        """Return stored rows, with what the sampler says of them, and what is still to be set."""
-        if isinstance(self._storage, SignalTensorStorage) and isinstance(index, Tensor):
-            # Entries of the top that have a number for each row.
-            beside = {
-                key: value
-                for key, value in info.items()
-                if isinstance(key, str)
-                and isinstance(value, Tensor)
-                and value.shape[:1] == index.shape
-            }
-            if (data := self._storage.batch(index, beside)) is not None:
-                return data, {key: value for key, value in info.items() if key not in beside}
-        return self._storage.get(index), info
 
     @opaque
     def sample(
@@ -421,23 +406,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             self._consume_after_n_samples = state.get("_consume_after_n_samples")
             if generator is not None:
                 self.set_rng(generator)
-
-    def _record_cursor(self) -> None:
-        """Tell the storage what was written last, of which TorchRL keeps no record."""
-        storage, cursor = self._storage, getattr(self._writer, "_cursor", None)
-        if cursor is not None and len(storage) and not self._is_consuming():
-            # A list has no dimension but its own.
-            length = getattr(storage, "_len_along_dim0", None) or len(storage)
-            storage._set_last_cursor((cursor - 1) % length)
-
-    def _check_loaded(self) -> None:
-        """Reject loaded transitions that could not have been written."""
-        length = len(self._storage)
-        if self._fuses and self._sampler.table.size != length:
-            size = self._sampler.table.size
-            raise ValueError(f"the saved storage has {length} rows, its signals {size}")
-        if length and isinstance(data := self._storage[:], TensorDictBase):
-            check_finite_entries(data, self._storage.ndim, self._allow_nonfinite)
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder, whole or not at all, with a checksum of each file.

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -47,6 +47,7 @@ from torchrl_mpfa.checks import (
     check_shape,
     keep,
     kind_of,
+    unknown,
 )
 
 if TYPE_CHECKING:
@@ -231,6 +232,15 @@ class Fusion:
             One weight a signal, in the order of ``names``, shape ``[K]``.
         """
         raise NotImplementedError(f"{type(self).__name__} must have a method weights()")
+
+
+def check_fusion(fusion: Any, fused: Sequence[str]) -> None:
+    """Reject what is no fusion, or one of signals that are not fused."""
+    if not isinstance(fusion, Fusion):
+        raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {kind_of(fusion)}")
+    for name in fusion.signal_names:
+        if name not in fused:
+            raise ValueError(unknown("signal of the fusion", name, fused))
 
 
 def checked_weights(

@@ -331,6 +331,23 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             super().empty(empty_write_count)
         self._memory.empty()
 
+    def _check_loaded(self) -> None:
+        """Reject loaded transitions that could not have been written."""
+        length = len(self._storage)
+        if isinstance(self._sampler, SignalSampler) and self._sampler.table.size != length:
+            size = self._sampler.table.size
+            raise ValueError(f"the saved storage has {length} rows, its signals {size}")
+        if length and isinstance(data := self._storage[:], TensorDictBase):
+            check_finite_entries(data, self._storage.ndim, self._allow_nonfinite)
+
+    def _record_cursor(self) -> None:
+        """Tell the storage what was written last, of which TorchRL keeps no record."""
+        storage, cursor = self._storage, getattr(self._writer, "_cursor", None)
+        if cursor is not None and len(storage) and not self._is_consuming():
+            # A list has no dimension but its own.
+            length = getattr(storage, "_len_along_dim0", None) or len(storage)
+            storage._set_last_cursor((cursor - 1) % length)
+
     def _check_owned(self) -> None:
         """Reject in another process what would pass the sampler of this one by."""
         if isinstance(self.sampler, WriterSampler):

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level, check_adjustments
 from torchrl_mpfa.checks import (
     LEVEL,
     NOT_NEGATIVE,
@@ -20,16 +20,14 @@ from torchrl_mpfa.checks import (
     check_counts,
     check_index,
     check_shape,
-    kind_of,
-    unknown,
 )
-from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
+from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
 from torchrl_mpfa.samplers.compiled import is_compiled, sample_compiled, update_compiled
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
 from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
-from torchrl_mpfa.samplers.weighing import Weighing, restored_weighing, weigh
+from torchrl_mpfa.samplers.weighing import Weighing, restored_weighing, warn_of_mean, weigh
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import REWARD, Signal, as_signals
 
@@ -121,13 +119,7 @@ class SignalSampler(TreeSampler):
         self.fusion = equal if fusion is None else fusion
         self.adjustments = adjustments
         self._positive_above: Level = check(LEVEL, positive_above=positive_above)
-        if self.positive_above == "mean" and self.fusion.uses_level:
-            warnings.warn(
-                "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
-                "all signals get equal weights for any data. With a number between the "
-                "rewards the weights follow the data",
-                stacklevel=2,
-            )
+        warn_of_mean(positive_above, self.fusion)
         self.entropy_refresh: float = check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         if agents not in (None, *get_args(Agents)):
             raise ValueError(f"agents must be 'max', 'mean' or None, got {agents!r}")
@@ -162,12 +154,7 @@ class SignalSampler(TreeSampler):
 
     @fusion.setter
     def fusion(self, fusion: Fusion) -> None:
-        if not isinstance(fusion, Fusion):
-            raise TypeError(f"fusion must be a torchrl_mpfa.Fusion, got {kind_of(fusion)}")
-        fused = [signal.name for signal in self._signals]
-        for name in fusion.signal_names:
-            if name not in fused:
-                raise ValueError(unknown("signal of the fusion", name, fused))
+        check_fusion(fusion, [signal.name for signal in self._signals])
         self._fusion, self._weighing = fusion, None
 
     @property
@@ -177,10 +164,7 @@ class SignalSampler(TreeSampler):
 
     @adjustments.setter
     def adjustments(self, adjustments: Sequence[Adjustment]) -> None:
-        listed = isinstance(adjustments, Sequence)
-        if not (listed and all(isinstance(adjust, Adjustment) for adjust in adjustments)):
-            kinds = ", ".join(map(kind_of, adjustments)) if listed else kind_of(adjustments)
-            raise TypeError(f"adjustments must be a list of torchrl_mpfa.Adjustment, got {kinds}")
+        check_adjustments(adjustments)
         self._adjustments, self._weighing = tuple(adjustments), None
         self._counting = [adjust.counts for adjust in adjustments]
 

@@ -77,8 +77,6 @@ class TreeSampler(SavedTrees):
 
     _rng: torch.Generator | None
     _device: torch.device | None
-    _alpha: float
-    _beta: float
 
     @torch.inference_mode(False)
     def __init__(
@@ -125,16 +123,6 @@ class TreeSampler(SavedTrees):
     def device(self) -> torch.device:
         """Device of priorities and sampled slots."""
         return self._device or torch.device("cpu")
-
-    @property
-    def _priorities(self) -> Tensor:
-        """Priorities, eps included and before alpha, NaN where nothing was written, ``[N]``."""
-        # Beside compiled trees they are in one tensor, of which a pickle would copy a view apart.
-        return self._sum_tree.priorities if self._apart is None else self._apart
-
-    @_priorities.setter
-    def _priorities(self, value: Tensor) -> None:
-        self._priorities.copy_(value)
 
     def _maybe_init_from_storage(self, storage: Storage | None) -> None:
         """Take the capacity of a storage and move to its device, once they are known."""

@@ -78,7 +78,20 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
 
     KIND = "proportional"
     SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest", "_highest_slot", "_priorities")
-    _priorities: Any
+    _alpha: float
+    _beta: float
+    _sum_tree: Any
+    _apart: Any
+
+    @property
+    def _priorities(self) -> Tensor:
+        """Priorities, eps included and before alpha, NaN where nothing was written, ``[N]``."""
+        # Beside compiled trees they are in one tensor, of which a pickle would copy a view apart.
+        return self._sum_tree.priorities if self._apart is None else self._apart
+
+    @_priorities.setter
+    def _priorities(self, value: Tensor) -> None:
+        self._priorities.copy_(value)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on but for the generator, on the CPU."""

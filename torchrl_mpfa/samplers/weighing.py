@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -9,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import check_not_negative
-from torchrl_mpfa.fusion import checked_weights
+from torchrl_mpfa.fusion import Fusion, checked_weights
 from torchrl_mpfa.saving import check_saved
 
 if TYPE_CHECKING:
@@ -152,3 +154,14 @@ def one_sided(sampler: SignalSampler) -> str | None:
         "reward, and boost and decay separate no transitions. Set positive_above to a "
         "level between the rewards, or to 'mean', with which all weights are equal"
     )
+
+
+def warn_of_mean(level: Level, fusion: Fusion) -> None:
+    """Warn of a level by which the entropies say nothing of the data."""
+    if level == "mean" and fusion.uses_level:
+        warnings.warn(
+            "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
+            "all signals get equal weights for any data. With a number between the "
+            "rewards the weights follow the data",
+            stacklevel=3,
+        )

@@ -327,6 +327,20 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
             self._storage = data.memmap()
 
 
+def rows_with(storage: Any, index: Any, info: dict[Any, Any]) -> tuple[Any, dict[Any, Any]]:
+    """Return stored rows, with what a sampler says of them, and what of that is still to be set."""
+    if isinstance(storage, SignalTensorStorage) and isinstance(index, Tensor):
+        # Entries of the top that have a number for each row.
+        beside = {
+            key: value
+            for key, value in info.items()
+            if isinstance(key, str) and isinstance(value, Tensor) and value.shape[:1] == index.shape
+        }
+        if (data := storage.batch(index, beside)) is not None:
+            return data, {key: value for key, value in info.items() if key not in beside}
+    return storage.get(index), info
+
+
 def _is_batch(slots: Any) -> bool:
     """Return True if an index is one slot or more in a tensor on the CPU, ``[B]``."""
     return (
