@@ -96,12 +96,7 @@ def soft_value(values: Tensor, log_density: Tensor, *, alpha: float | Tensor) ->
 
 
 def distance(
-    value: Tensor,
-    target: Tensor,
-    loss_function: str,
-    *,
-    unit: float = 1.0,
-    pal_alpha: float = 0.4,
+    value: Tensor, target: Tensor, loss_function: str, *, unit: float = 1.0, pal_alpha: float = 0.4
 ) -> Tensor:
     """Distance of value and target, ``[C, B]`` or ``[B]``, one of :data:`DISTANCES`.
 

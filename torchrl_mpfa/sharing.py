@@ -17,7 +17,14 @@ _RAY = "torchrl_mpfa.integrations.ray.make_ray_replay has a buffer that any proc
 
 
 class WriterSampler(RandomSampler):
-    """Sampler of a buffer in another process, which writes transitions and does nothing else."""
+    """Sampler of a buffer in another process, which writes transitions and does nothing else.
+
+    Args:
+        by_priority: True if the process that made the buffer samples by priority.
+    """
+
+    def __init__(self, *, by_priority: bool) -> None:
+        self.by_priority = by_priority
 
     def reject(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise: signals and priorities are in the process that made the buffer."""
@@ -64,7 +71,9 @@ class SharedWrites:
         buffer = self._buffer
         sampler, storage, end = buffer._sampler, buffer._storage, int(buffer._writer._cursor)
         rows = [entry for entry in tree_leaves(storage._storage) if isinstance(entry, torch.Tensor)]
-        if not all(entry.is_shared() or isinstance(entry, MemoryMappedTensor) for entry in rows):
+        # An entry without numbers has nothing to share.
+        apart = [e for e in rows if e.numel() and not isinstance(e, MemoryMappedTensor)]
+        if not all(entry.is_shared() for entry in apart):
             raise RuntimeError(
                 "the transitions of another process are not in shared memory: start it by 'spawn', "
                 f"not by 'fork'. {_RAY}"

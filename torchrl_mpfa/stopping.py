@@ -32,10 +32,7 @@ class Stop:
     """
 
     def __init__(
-        self,
-        answer: str = "stopping and saving",
-        *,
-        write: Callable[[str], object] | None = None,
+        self, answer: str = "stopping and saving", *, write: Callable[[str], object] | None = None
     ) -> None:
         self.answer = answer
         self._write = write or (lambda text: sys.stderr.write(f"{text}\n"))

@@ -63,7 +63,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             check_shared(self)
         # A copy of the generator's state would be gone before the process reads it.
         state = {**super().__getstate__(), "_schema": None, "_rng": None}
-        return {**state, "_sampler": WriterSampler()} if keeps else state
+        by_priority = isinstance(self._sampler, PrioritizedSampler)
+        return {**state, "_sampler": WriterSampler(by_priority=by_priority)} if keeps else state
 
     def _checks(self, data: Any) -> bool:
         # The property, not the attribute: with delayed_init the parts are made at their first use.
@@ -90,8 +91,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         Raises:
             KeyError: If an entry is missing or unknown; nothing is changed.
             ValueError: If an entry has another shape or dtype than in the storage, a number is not
-                finite, a first priority cannot be, there is no batch size, or padding cannot be
-                left out; nothing is changed, in the transforms neither.
+                finite, a first priority cannot be or comes in another process, there is no batch
+                size, or padding cannot be left out; nothing is changed, in the transforms neither.
         """
         if not self._checks(tensordicts):
             return super().extend(tensordicts, update_priority=update_priority)
@@ -183,6 +184,11 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _first_priorities(self, priority: Any, shape: torch.Size, prioritizes: bool) -> Any:
         """Return priorities of new transitions in the order of their slots, once checked."""
         name = f"{self.priority_key!r} of the transitions"
+        if isinstance(self._sampler, WriterSampler) and self._sampler.by_priority:
+            raise ValueError(
+                f"{name} must not be given in another process than that of the sampler: leave the "
+                "entry out, and the transitions get the highest priority"
+            )
         # A reward that is no priority may be negative.
         by_priority = isinstance(self._sampler, PrioritizedSampler)
         if not by_priority and as_path(self.priority_key) == REWARD_KEY:

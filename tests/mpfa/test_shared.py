@@ -32,6 +32,10 @@ def write(buffer, firsts):
     wrong["next", "reward"][2] = torch.nan
     with pytest.raises(ValueError, match=r"reward.* must be finite"):
         buffer.extend(wrong)
+    if buffer.sampler.by_priority:
+        first = make_transitions(4).set("td_error", torch.ones(4))
+        with pytest.raises(ValueError, match="must not be given in another process"):
+            buffer.extend(first)
 
 
 def elsewhere(work, *args, method="spawn"):

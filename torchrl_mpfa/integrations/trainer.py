@@ -10,11 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl.trainers import (
-    DefaultOptimizationStepper,
-    OptimizationStepper,
-    Trainer,
-)
+from torchrl.trainers import DefaultOptimizationStepper, OptimizationStepper, Trainer
 
 from torchrl_mpfa.checks import kind_of
 from torchrl_mpfa.losses import SUPPORTED, write_signals

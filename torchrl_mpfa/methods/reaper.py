@@ -103,6 +103,7 @@ class ReaPERSampler(SignalSampler):
     """
 
     KIND = "reaper"
+    READS_ROWS = True
     KEPT = (EPISODE, ENDED)
     _steps: Any = None
     """The storage that is sampled from."""

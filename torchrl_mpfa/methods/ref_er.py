@@ -24,12 +24,7 @@ from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, POSITIVE, SHARE, check
-from torchrl_mpfa.losses import (
-    BEHAVIOR_MEAN,
-    BEHAVIOR_SIGMA,
-    BEHAVIOR_WEIGHT,
-    POLICY_WEIGHT,
-)
+from torchrl_mpfa.losses import BEHAVIOR_MEAN, BEHAVIOR_SIGMA, BEHAVIOR_WEIGHT, POLICY_WEIGHT
 from torchrl_mpfa.methods.klper import actions_of
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.selection import SampledBatch

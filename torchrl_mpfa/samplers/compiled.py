@@ -30,14 +30,7 @@ if TYPE_CHECKING:
 
 _BOUNDS = {"floor": 1, "cap": 2, "none": 3}
 _MARGIN = above_mean(torch.double)
-_KINDS: list[tuple[type, ...]] = [
-    (),
-    (PositiveBoost,),
-    (PositiveDecay,),
-    (PositiveBoost, PositiveDecay),
-]
-
-
+_KINDS: Any = ((), (PositiveBoost,), (PositiveDecay,), (PositiveBoost, PositiveDecay))
 _STEPS = (
     *("mark_update", "_record", "check_new", "_sampled", "_sample_slots", "_proportional"),
     *("_fused", "combined", "_checked", "_set", "_write", "_write_leaves", "_leaf"),

@@ -10,17 +10,10 @@ from typing import Any, get_args
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Storage
+from torchrl.data import Storage, TensorStorage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level, check_adjustments
-from torchrl_mpfa.checks import (
-    LEVEL,
-    NOT_NEGATIVE,
-    check,
-    check_counts,
-    check_index,
-    check_shape,
-)
+from torchrl_mpfa.checks import LEVEL, NOT_NEGATIVE, check, check_counts, check_index, check_shape
 from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
 from torchrl_mpfa.samplers.compiled import is_compiled, sample_compiled, update_compiled
 from torchrl_mpfa.samplers.composition import composition
@@ -89,6 +82,8 @@ class SignalSampler(TreeSampler):
     _weighing: Weighing | None
     KEPT: tuple[Signal, ...] = ()
     """Further entries of transitions that the table keeps."""
+    READS_ROWS = False
+    """True if neighbours of a transition are looked for among the stored tensors."""
 
     def __init__(
         self,
@@ -236,6 +231,11 @@ class SignalSampler(TreeSampler):
 
     def attach(self, storage: Storage) -> SignalTable:
         """Use the storage of a buffer that hands signals on; return the table of the signals."""
+        if self.READS_ROWS and not isinstance(storage, TensorStorage):
+            raise TypeError(
+                f"storage must hold tensors of all steps with {type(self).__name__}, as "
+                f"SignalTensorStorage does, got {type(storage).__name__}"
+            )
         self._maybe_init_from_storage(storage)
         self._attached = True
         return self.table

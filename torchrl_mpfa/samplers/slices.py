@@ -82,6 +82,7 @@ class SignalSliceSampler(SignalSampler):
     """
 
     KIND = "slices"
+    READS_ROWS = True
     SAVED = (*SignalSampler.SAVED, *_SETTINGS, "_joined", "_stride")
 
     def __init__(

@@ -140,11 +140,7 @@ class SignalTable:
         return rows
 
     def fill_learned(
-        self,
-        rows: Tensor,
-        signals: Mapping[str, Tensor],
-        live: Tensor | None,
-        sizes: Sequence[int],
+        self, rows: Tensor, signals: Mapping[str, Tensor], live: Tensor | None, sizes: Sequence[int]
     ) -> None:
         """Write learned signals of live rows in copies of them, batch by batch."""
         count = len(rows) if live is None else len(live)

@@ -127,10 +127,7 @@ def _count(sampler: SignalSampler, batch_size: int, weighing: Weighing) -> Weigh
         if value is not None:
             check_not_negative("what an adjustment counted", value)
     return replace(
-        weighing,
-        counted=tuple(counted),
-        counted_writes=table.writes,
-        learned_since=batch_size,
+        weighing, counted=tuple(counted), counted_writes=table.writes, learned_since=batch_size
     )
 
 

@@ -83,6 +83,13 @@ def test_an_entry_without_numbers_in_a_mapped_file_is_rejected_at_the_save(saved
         twins.save()
 
 
+@pytest.mark.parametrize("sampler", ["slices", "starts", "reaper"])
+def test_a_list_is_rejected_by_what_looks_at_neighbours_of_a_row(sampler, tmp_path):
+    plain = {name: next(iter(values)) for name, values in AXES.items()}
+    with pytest.raises(TypeError, match="storage must hold tensors of all steps"):
+        Twins({**plain, "sampler": sampler, "storage": "list"}, tmp_path)
+
+
 class Walk(RuleBasedStateMachine):
     """Operations in any order, on parts that fit each other."""
 
