@@ -37,6 +37,12 @@ def size_of(arguments: dict[str, Any]) -> int:
     return max(part.stop for part in observation_slices(sectors, **remembered).values())
 
 
+@pytest.mark.parametrize("wrong", [{"observation_size": 25}, {"history": 2}, {"action_size": 3}])
+def test_a_card_of_other_sizes_than_it_senses_is_rejected_however_it_is_made(wrong):
+    with pytest.raises(ValueError, match=r"(observation|action)\.size must be"):
+        replace(card(), **wrong)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -101,6 +101,18 @@ class Card:
     training: Mapping[str, Any]
     """Facts about its training."""
 
+    def __post_init__(self) -> None:
+        # A compiled loop writes as many numbers as the parts have.
+        if self.action_size != 2:
+            raise ValueError(f"action.size must be 2, a left and a right wheel: {self.action_size}")
+        memory: Any = self.memory
+        parts = observation_slices(self.sectors, memory=memory, history=self.history)
+        if self.observation_size != (sensed := max(part.stop for part in parts.values())):
+            raise ValueError(
+                f"observation.size must be {sensed}, of {self.sectors} sectors, history "
+                f"{self.history} and memory {self.memory!r}, got {self.observation_size}"
+            )
+
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Card:
         """Read a card from the values of its JSON file.
@@ -122,22 +134,12 @@ class Card:
         for name, value in SCALES.items():
             if document["scales"][name] != value:
                 raise ValueError(f"scales.{name} must be {value}, got {document['scales'][name]!r}")
-        card = cls(
+        return cls(
             **{
                 field: read(entry, reduce(getitem, entry.split("."), document))
                 for field, (entry, read) in _ENTRIES.items()
             }
         )
-        if card.action_size != 2:
-            raise ValueError(f"action.size must be 2, a left and a right wheel: {card.action_size}")
-        memory: Any = card.memory
-        parts = observation_slices(card.sectors, memory=memory, history=card.history)
-        if card.observation_size != (sensed := max(part.stop for part in parts.values())):
-            raise ValueError(
-                f"observation.size must be {sensed}, of {card.sectors} sectors, history "
-                f"{card.history} and memory {card.memory!r}, got {card.observation_size}"
-            )
-        return card
 
 
 def card_file(path: str | os.PathLike[str]) -> Path:
