@@ -7,7 +7,8 @@
 MuJoCo's tasks need the extra ``mujoco``. Batches of 100 and rates of 0.001 are those of TD3's
 paper; networks have 2 x 256 units, and the first 5,000 steps are at random. ``scores.csv`` in the
 folder of a run has the mean return of ten episodes without noise. The file is written at the end:
-a run that was stopped begins again.
+a run that was stopped begins again. Methods that ask for more than a buffer and a loss, as
+hindsight does, are trained by ``train.py``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from torch import Tensor, nn
 from tqdm import trange
 
 import torchrl_mpfa as mpfa
-from torchrl_mpfa.methods import loss_options, make_replay
+from torchrl_mpfa.methods import loss_options, make_replay, method_named
 from torchrl_mpfa.saving import write_text_atomically
 
 BATCH_SIZE, WIDTH = 100, 256
@@ -39,7 +41,7 @@ STEPS_A_ROUND = 10
 """Steps of the task between two rounds of as many updates."""
 EPISODES = 10
 """Episodes of an evaluation."""
-SCORES = "scores.csv"
+SCORES, SETTINGS = "scores.csv", "settings.json"
 
 
 class Task:
@@ -123,10 +125,8 @@ def train(options: argparse.Namespace) -> list[list[object]]:
     torch.manual_seed(options.seed)
     source = np.random.default_rng(options.seed)
     task = Task(options.task, seed=options.seed)
-    separated: dict[str, Any] = {}
-    if options.replay.startswith("mpfa"):
-        separated["positive_above"] = options.positive_above
-    replay = make_replay(options.replay, capacity=options.steps, batch_size=BATCH_SIZE, **separated)
+    level = {} if options.positive_above is None else {"positive_above": options.positive_above}
+    replay = make_replay(options.replay, capacity=options.steps, batch_size=BATCH_SIZE, **level)
     sizes: dict[str, Any] = {"width": WIDTH, "layer_norm": False}
     actor = mpfa.make_actor(task.observations, task.actions, **sizes)
     learner = mpfa.ActorCritic(
@@ -163,9 +163,10 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", default="HalfCheetah-v5", help="a Gymnasium id")
-    parser.add_argument("--replay", choices=sorted(mpfa.METHODS), default="mpfa_per")
+    offered = sorted(name for name, method in mpfa.METHODS.items() if not method.beside)
+    parser.add_argument("--replay", choices=offered, default="mpfa_per")
     parser.add_argument(
-        "--positive-above", type=float, default=0.0, help="reward, for MPFA-PER; between rewards"
+        "--positive-above", type=float, help="reward, for MPFA-PER; between rewards"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=100_000)
@@ -176,17 +177,31 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     options = parser.parse_args(arguments)
     if options.start < BATCH_SIZE:
         parser.error(f"--start must be at least one batch of {BATCH_SIZE}, got {options.start}")
+    if not STEPS_A_ROUND <= options.every <= options.steps:
+        parser.error(f"--every must be in {STEPS_A_ROUND} to {options.steps}, got {options.every}")
+    if options.positive_above is not None:
+        try:
+            method_named(options.replay, positive_above=options.positive_above)
+        except (TypeError, ValueError) as error:
+            parser.error(f"--positive-above: {error}")
     folder: Path = options.folder / f"{options.task}-{options.replay}-{options.seed}"
-    if (folder / SCORES).exists():
-        print(f"{folder} has its scores already")
-        return folder
+    chosen = json.dumps({k: v for k, v in vars(options).items() if k != "folder"}, indent=1)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / SCORES).exists():
+            if (folder / SETTINGS).exists() and (folder / SETTINGS).read_text() != chosen:
+                parser.error(f"{folder} has a run with other settings: choose another --folder")
+            print(f"{folder} has its scores already")
+            return folder
+        write_text_atomically(chosen, folder / SETTINGS)
+    except OSError as error:
+        parser.error(str(error))
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)  # Tiny numbers would slow a CPU down.
     text = io.StringIO()
     written = csv.writer(text, lineterminator="\n")
     written.writerow(["task", "method", "seed", "steps", "score"])
     written.writerows(train(options))
-    folder.mkdir(parents=True, exist_ok=True)
     write_text_atomically(text.getvalue(), folder / SCORES)
     print(f"written: {folder / SCORES}")
     return folder

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 
 import gymnasium_td3
 from gymnasium_td3 import SCORES, Task, collect
+from torchrl_mpfa.methods import METHODS
 
 
 def rounds_of(number: int) -> tuple[Task, TensorDictBase]:
@@ -51,10 +52,41 @@ def test_action_reaches_the_whole_range_of_the_task() -> None:
     assert turned == pytest.approx((15.0 * np.sin(state[0]) + 3.0 * 2.0) * 0.05, abs=1e-6)
 
 
-def test_start_below_a_batch_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--start", "99"], "--start must be at least one batch of 100, got 99"),
+        (["--every", "300", "--steps", "200"], "--every must be in 10 to 200, got 300"),
+        (["--replay", "her"], "invalid choice: 'her'"),
+        (["--replay", "per", "--positive-above", "1"], "--positive-above: "),
+        (["--folder", "/dev/null"], "/dev/null"),
+    ],
+)
+def test_what_the_page_cannot_do_is_rejected_before_it_trains(
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(gymnasium_td3, "train", lambda options: pytest.fail("trained"))
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
-        gymnasium_td3.main(["--start", "99"])
-    assert "--start must be at least one batch of 100, got 99" in capsys.readouterr().err
+        gymnasium_td3.main(words)
+    assert message in capsys.readouterr().err
+
+
+def test_methods_that_ask_for_more_than_a_buffer_and_a_loss_are_named_by_what_they_ask() -> None:
+    beside = {name: method.beside for name, method in METHODS.items() if method.beside}
+    assert beside == {
+        "averaged_ddpg": ("target_average",),
+        "ddpg_radam": ("curiosity", "optimizer"),
+        "her": ("hindsight", "episode"),
+        "klper": ("policy", "sigma"),
+        "reaper": ("episode",),
+        "ref_er": ("policy", "behavior_mean", "behavior_sigma"),
+        "rud": ("update_block",),
+    }
 
 
 @pytest.mark.filterwarnings("ignore:none of the .* rewards in the buffer are above")
@@ -68,13 +100,15 @@ def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
     assert {row["method"] for row in rows} == {"td3/mpfa_per"}
     monkeypatch.setattr(gymnasium_td3, "train", lambda options: pytest.fail("made again"))
     assert gymnasium_td3.main(command) == folder
+    with pytest.raises(SystemExit):
+        gymnasium_td3.main([*command, "--every", "100"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("replay", ["uniform", "mpfa_per"])
 def test_pendulum_swings_up(replay: str, tmp_path: Path) -> None:
     short = ["--task", "Pendulum-v1", "--steps", "6000", "--start", "1000", "--every", "6000"]
-    short += ["--positive-above", "-2"]
+    short += ["--positive-above", "-2"] if replay == "mpfa_per" else []
     folder = gymnasium_td3.main([*short, "--replay", replay, "--folder", str(tmp_path)])
     [row] = scores_in(folder)
     # At random some -1,200; a policy that swings up reaches -150.

@@ -99,6 +99,20 @@ class Method:
         return ("episode",) if self.hindsight else ()
 
     @property
+    def beside(self) -> tuple[str, ...]:
+        """What a training has to do for the method beside its buffer and loss, by settings.
+
+        Examples:
+            >>> from torchrl_mpfa.methods import METHODS
+            >>> METHODS["her"].beside, METHODS["per"].beside
+            (('hindsight', 'episode'), ())
+        """
+        plain = {"optimizer": "adam", "update_block": 1, "target_average": 1}
+        asked = [name for name in ("hindsight", "curiosity") if getattr(self, name)]
+        asked += [name for name, value in plain.items() if getattr(self, name) != value]
+        return (*asked, *self.needs, *self.entries)
+
+    @property
     def remote(self) -> bool:
         """True if the buffer may be in another process than the learner."""
         return not self.entries
