@@ -5,8 +5,8 @@
 
 Every arm has the settings of ``examples/sparse.yaml`` but for its method. Rows are added to the
 file after every five seeds of an arm, and runs that have rows are not made again: the same command
-continues. Tables are printed once all runs are there, or with ``--kept``. Rows are those of
-``benchmarks.sparse``.
+continues. Tables are printed once all runs are there, or with ``--kept``; the last one has what the
+design planned. Rows are those of ``benchmarks.sparse``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from pathlib import Path
 import pandas as pd
 
 from benchmarks import sparse
-from training.comparison.scores import COLUMNS
+from benchmarks.planned import Planned, planned_table
+from training.comparison.scores import COLUMNS, runs_by_task
 from training.files import run_script
-from training.records import read_table, write_table
+from training.records import area_under, read_table, write_table
 
 KEPT = sparse.KEPT.with_name("rivals.csv")
 REGIME = "simple"
@@ -58,6 +59,28 @@ def make(folder: Path, kept: Path, jobs: int) -> int:
     return 0
 
 
+def answer(kept: Path = KEPT) -> str:
+    """Return the differences that the design planned, of kept rows."""
+    tasks = runs_by_task([kept])
+    curves, last = tasks[f"{REGIME}, validation"], tasks[f"{REGIME}, test"]
+    area = {
+        arm: {seed: area_under(*run) for seed, run in runs.items()} for arm, runs in curves.items()
+    }
+    ends = {
+        arm: {seed: float(run[1][-1]) for seed, run in runs.items()} for arm, runs in last.items()
+    }
+
+    def planned(ours: str, theirs: str, measure: str = "area") -> Planned:
+        of_arm = area if measure == "area" else ends
+        return Planned(f"{ours} − {theirs}", measure, of_arm[ours], of_arm[theirs])
+
+    per, her, mpfa, halves, uniform = METHODS
+    secondary = [planned(mpfa, per), planned(halves, her), planned(her, uniform)]
+    return planned_table(
+        [planned(per, her)], [*secondary, planned(per, her, "success of the last policy")]
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the missing runs, or print the tables; return the exit status."""
     parser = argparse.ArgumentParser(
@@ -72,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.kept and (status := make(options.folder, options.output, options.jobs)):
         return status
-    print("\n\n".join(sparse.tables(options.output)))
+    print("\n\n".join([*sparse.tables(options.output), answer(options.output)]))
     return 0
 
 

@@ -53,3 +53,21 @@ def test_command_makes_only_runs_without_rows(
     made.clear()
     assert rivals.make(tmp_path, kept, jobs=1) == 130
     assert list(made) == [f"simple: {name}" for name in rivals.METHODS[2:]]
+
+
+def test_the_tables_of_the_page_are_those_of_the_kept_rows() -> None:
+    page = sparse.KEPT.with_suffix(".md").read_text(encoding="utf-8")
+    arms, heading, differences = sparse.tables(rivals.KEPT)
+    assert heading == "### Simple"
+    for table in (rivals.answer(), arms, differences):
+        assert table in page
+
+
+def test_answer_has_the_planned_differences_and_corrects_the_secondary_ones_alone() -> None:
+    rows = [line.split(" | ") for line in rivals.answer().splitlines()[2:]]
+    assert rows[0][0] == "| PER with hindsight − HER" and float(rows[0][4].strip(" |")) == 0.001
+    kept = pd.read_csv(rivals.KEPT)
+    last = kept[kept["task"] == "simple, test"].set_index(["method", "seed"])["score"]
+    gap = (last["PER with hindsight"] - last["HER"]).mean()
+    assert float(rows[4][2]) == pytest.approx(gap, abs=5e-4)
+    assert len(rows) == 5
