@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import torch
@@ -140,7 +140,7 @@ class BatchFacts:
     written_at: Tensor | None = None
     counted: Tensor | None = None
 
-    @property
+    @cached_property
     def positive(self) -> Tensor:
         """Mask of positive transitions, :math:`r_i > 0` in the paper (Eqs. 22-24), ``[B]``."""
         return self.reward > self.level
@@ -295,9 +295,7 @@ class PositiveDecay(Adjustment):
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Decay the positive transitions above the threshold, shape ``[B]``."""
-        mean = decay_threshold(priority)
-        # A number is faster on the CPU; a GPU would be waited for.
-        threshold = mean.item() if mean.is_cpu and mean.ndim == 0 else mean.unsqueeze(-1)
+        threshold = decay_threshold(priority).unsqueeze(-1)
         decayed = priority * self.factors(priority, batch)
         above = priority > threshold * above_mean(priority.dtype)
         return torch.where(batch.positive & above, decayed, priority)

@@ -140,7 +140,7 @@ def bounds(values: Tensor) -> tuple[float, float]:
 
 def check_index(index: Tensor, size: int) -> Tensor:
     """Return the slots without -1, by which TorchRL's writers mark what was not stored."""
-    low, high = bounds(index) if len(index) else (0, -1)
+    low, high = bounds(index) if index.numel() else (0, -1)
     if low < -1 or high >= size:
         raise IndexError(f"index must be in [0, {size}), got {low if low < -1 else high}")
     return index[index >= 0] if low == -1 else index

@@ -177,9 +177,10 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
         [2.0]
     """
     # Signal by signal: a product of matrices adds in an order that depends on their size.
-    priority = signals.select(1, 0) * weights[0]
-    for place in range(1, len(weights)):
-        priority = priority + signals.select(1, place) * weights[place]
+    first, *others = zip(signals.unbind(1), weights.unbind(), strict=True)
+    priority = first[0] * first[1]
+    for signal, weight in others:
+        priority = priority + signal * weight
     return priority + eps
 
 

@@ -58,8 +58,7 @@ class LA3PSampler(SignalSampler):
         super()._init()
         self._inverse_tree = empty_tree_like(self._sum_tree, self._max_capacity, self.device)
 
-    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
-        super()._write_leaves(slots, leaf)
+    def _follow(self, slots: Tensor, leaf: Tensor) -> None:
         set_leaves(slots, 1.0 / leaf, self._inverse_tree)
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:

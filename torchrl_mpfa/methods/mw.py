@@ -66,8 +66,7 @@ class MWSampler(SignalSampler):
         self._spent[slots] = self.table.replay_counts(slots) >= self.replay_cap
         super()._set(slots, priority, highest)
 
-    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
-        super()._write_leaves(slots, leaf)
+    def _follow(self, slots: Tensor, leaf: Tensor) -> None:
         spent = slots[self._spent[slots]]
         if len(spent):
             set_leaves(spent, leaf.new_zeros(len(spent)), self._sum_tree)

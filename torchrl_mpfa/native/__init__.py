@@ -51,6 +51,7 @@ class Fusion(Structure):
 _P, _I, _D = c_void_p, c_int64, c_double
 _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "set_leaves": (_I, [_P, _I, _I, _I, _I, _P, _P, _I]),
+    "put": (_I, [_P, _I, _I, _P, _P, _P, _I, _I]),
     "query": (_D, [_P, _I, _I, _I, _I, _I, _I]),
     "find": (None, [_P, _I, _I, _I, _I, _P, _I, _P]),
     "gather": (_I, [_P, _I, _P, _I, _I]),

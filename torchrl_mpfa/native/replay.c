@@ -174,12 +174,10 @@ static inline void ask_for(const Replay *r, const int64_t *slots, int64_t i, int
   __builtin_prefetch(row_of(r, slots[i + AHEAD < n ? i + AHEAD : i]));
 }
 
-static void lift(const Replay *r, const int64_t *slots, int64_t n) {
-  Node *t = r->nodes;
-  int64_t blocks = r->blocks;
+static void lift(Node *t, int64_t blocks, const int64_t *slots, int64_t n) {
   for (int64_t i = 0; i < n; i++) {
     int64_t b = slots[i] / BLOCK;
-    const Node *leaves = leaf_of(r, b * BLOCK);
+    const Node *leaves = t + 2 * blocks + b * BLOCK;
     t[blocks + b].sum = fold(&leaves->sum, 4, BLOCK, 0);
     t[blocks + b].lowest = fold(&leaves->lowest, 4, BLOCK, 1);
     t[blocks + b].highest = fold(&leaves->highest, 4, BLOCK, 1);
@@ -194,6 +192,17 @@ static void lift(const Replay *r, const int64_t *slots, int64_t n) {
       t[k].highest = least(a.highest, b.highest);
     }
   }
+}
+
+// Set leaves and priorities of slots, in all three trees. Returns 1, and writes nothing, if a slot is not
+// below `size`.
+int64_t put(Node *t, int64_t blocks, int64_t size, const int64_t *slots, const double *leaf,
+            const double *priority, int64_t learned, int64_t n) {
+  if (outside(slots, n, size)) return 1;
+  for (int64_t i = 0; i < n; i++)
+    t[2 * blocks + slots[i]] = (Node){leaf[i], leaf[i], learned ? -priority[i] : INFINITY, priority[i]};
+  lift(t, blocks, slots, n);
+  return 0;
 }
 
 // Sample by Eq. (8) out of the filled slots, with weights of Eq. (10) and times of writing, and count
@@ -274,7 +283,7 @@ int64_t update(const Replay *r, Fusion *f, const int64_t *slots, int64_t n, int6
     memcpy(row_of(r, slots[i]), rows + i * columns, 8 * columns);
     *leaf_of(r, slots[i]) = (Node){leaf, leaf, -priority[i], priority[i]};
   }
-  lift(r, slots, n);
+  lift(r->nodes, r->blocks, slots, n);
   // Of a slot that is named twice the last entry counts.
   for (int64_t i = top = 0; i < n; i++)
     if (leaf_of(r, slots[i])->priority > leaf_of(r, slots[top])->priority) top = i;
@@ -319,7 +328,7 @@ int64_t write_new(const Replay *r, const Column *columns, int64_t count, int64_t
     index[slots[i]] = slots[i];
     *leaf_of(r, slots[i]) = (Node){leaf, leaf, INFINITY, priority};
   }
-  lift(r, slots, n);
+  lift(r->nodes, r->blocks, slots, n);
   free(slots);
   return 0;
 }

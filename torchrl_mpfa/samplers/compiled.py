@@ -33,7 +33,7 @@ _MARGIN = above_mean(torch.double)
 _KINDS: Any = ((), (PositiveBoost,), (PositiveDecay,), (PositiveBoost, PositiveDecay))
 _STEPS = (
     *("mark_update", "_record", "check_new", "_sampled", "_sample_slots", "_proportional"),
-    *("_fused", "combined", "_checked", "_set", "_write", "_write_leaves", "_leaf"),
+    *("_fused", "combined", "_checked", "_set", "_write", "_follow", "_leaf"),
     "_empty_table",
 )
 """Steps that compiled loops know as they are in ``SignalSampler``."""

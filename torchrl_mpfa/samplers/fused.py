@@ -362,7 +362,7 @@ class SignalSampler(TreeSampler):
                 return 0
         slots = slots.to(table.device)
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
-        stale = 0 if live is None else len(live) - len(slots)
+        stale = 0 if live is None else live.numel() - slots.numel()
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
         table.fill_learned(rows, signals, live, sizes)
         table.check_fused(rows)
@@ -373,8 +373,8 @@ class SignalSampler(TreeSampler):
         groups = [(slots, rows)] if per_group > 1 else by_batch(sizes, slots, rows)
         weighing, priorities = self._weighing, []
         for group_slots, group_rows in groups:
-            if len(group_slots):
-                first_batch = group_slots[: len(group_slots) // per_group]
+            if count := group_slots.numel():
+                first_batch = group_slots[: count // per_group]
                 weighing = weigh(self, first_batch, weighing)  # Eqs. (15)-(20).
                 # Eqs. (21)-(24).
                 priorities.append(self._fused(table, group_rows, group_slots, weighing, per_group))

@@ -430,14 +430,23 @@ class TreeSampler(SavedTrees):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""
-        self._priorities.index_copy_(0, slots, priority)
-        self._write_leaves(slots, self._leaf(priority))
-        given = -priority if learned else torch.full_like(priority, math.inf)
-        set_leaves(slots, given, self._max_tree)
+        leaf = self._leaf(priority)
+        if self._apart is None:
+            self._sum_tree.put(slots, leaf, priority, learned=learned)
+        else:
+            self._priorities.index_copy_(0, slots, priority)
+            given = -priority if learned else torch.full_like(priority, math.inf)
+            set_leaves(slots, given, self._max_tree)
+            set_leaves(slots, leaf, self._sum_tree, self._min_tree)
+        self._follow(slots, leaf)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         """Write leaves, to which slots are sampled in proportion, shape ``[B]``."""
         set_leaves(slots, leaf, self._sum_tree, self._min_tree)
+        self._follow(slots, leaf)
+
+    def _follow(self, slots: Tensor, leaf: Tensor) -> None:
+        """Change what depends on leaves that were written: nothing here."""
 
     def _leaf(self, priority: Tensor) -> Tensor:
         """Return leaves, priorities to the power of alpha, shape ``[B]``."""

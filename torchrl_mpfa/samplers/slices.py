@@ -241,8 +241,8 @@ class SignalSliceSampler(SignalSampler):
         starts = slots.unsqueeze(1) - self._stride * torch.arange(self.slice_len, device="cpu")
         return (starts % self._max_capacity).unique()
 
-    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
-        # Not the leaves of the steps: those of the slices that the steps are in.
+    def _follow(self, slots: Tensor, leaf: Tensor) -> None:
+        # In place of the leaves of steps those of the slices that the steps are in.
         self._refresh(self._starts_around(slots) if self.slice_priority == "mean" else slots)
 
     def _refresh(self, starts: Tensor) -> None:

@@ -143,7 +143,7 @@ class SignalTable:
         self, rows: Tensor, signals: Mapping[str, Tensor], live: Tensor | None, sizes: Sequence[int]
     ) -> None:
         """Write learned signals of live rows in copies of them, batch by batch."""
-        count = len(rows) if live is None else len(live)
+        count = rows.shape[0] if live is None else len(live)
         for signal in self.learned:
             name = signal.name
             if name not in signals:
@@ -161,10 +161,10 @@ class SignalTable:
 
     def check_fused(self, rows: Tensor) -> None:
         """Reject rows whose signals cannot be fused: missing, negative or not finite."""
-        if len(rows) == 0:
+        if rows.numel() == 0:
             return
         # A NaN makes both of these NaN, so that one pass finds any wrong number.
-        chosen = rows[:, self.fused]
+        chosen = rows[:, self.fused].contiguous()
         low, high = bounds(chosen)
         if low >= 0 and high < math.inf:
             return
@@ -180,18 +180,20 @@ class SignalTable:
         """Return live rows and slots, the mask of live ones, and the sizes of batches."""
         # A batch from before the table was cleared is stale, as its times of writing show.
         filled = self.size if written_at is None else max(self.size, self.cleared)
-        check_counts(batches=batches)
-        if len(check_index(slots, filled)) < len(slots):
+        if type(batches) is not int or batches < 1:
+            check_counts(batches=batches)
+        count = slots.numel()
+        if check_index(slots, filled).numel() < count:
             raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-        if len(slots) % batches:
-            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
-        rows, sizes = self.rows.index_select(0, slots), [len(slots) // batches] * batches
+        if count % batches:
+            raise ValueError(f"{count} slots cannot make {batches} equal batches")
+        rows, sizes = self.rows.index_select(0, slots), [count // batches] * batches
         if written_at is None:
             return rows, slots, None, sizes
-        if written_at.numel() != len(rows):
+        if written_at.numel() != count:
             raise ValueError(
                 "written_at must have one number per transition, got shape "
-                f"{[*written_at.shape]} for {len(rows)} slots"
+                f"{[*written_at.shape]} for {count} slots"
             )
         now = rows.select(1, self.time_column)
         before = written_at.reshape(-1).to(now.device, now.dtype)

@@ -84,6 +84,16 @@ class SumTree(CompiledTree):
     EMPTY, MINIMUM = 0.0, False
 
     @opaque
+    def put(self, slots: Tensor, leaf: Tensor, priority: Tensor, *, learned: bool) -> None:
+        """Set leaves and priorities of slots in this and the two trees beside it, each ``[B]``."""
+        nodes, slots = address(self.nodes, torch.double), slots.contiguous()
+        leaf, priority = (v.double().expand(slots.shape).contiguous() for v in (leaf, priority))
+        values = address(leaf, torch.double), address(priority, torch.double)
+        place = nodes, self.blocks, self.size, address(slots, torch.long)
+        if loops().put(*place, *values, learned, slots.numel()):
+            raise IndexError(f"slots must be in [0, {self.size}), got {slots.tolist()}")
+
+    @opaque
     def slots_at(self, shares: Tensor, size: int) -> Tensor:
         """Return the slots at shares of the sum of the first slots, shape ``[B]``."""
         slots = torch.empty(shares.shape, dtype=torch.long, device="cpu")
@@ -240,7 +250,7 @@ def last_of_each(slots: Tensor) -> Tensor | None:
     if not slots.is_cpu:
         ordered, position = slots.sort(stable=True)
         return position[torch.searchsorted(ordered, slots, right=True) - 1]
-    count = len(slots)
+    count = slots.numel()
     if count <= _ORDERED:
         return None
     # One number for slot and position, as sorting numbers costs half of what unique() does.
