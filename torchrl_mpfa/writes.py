@@ -125,7 +125,6 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             or not isinstance(sampler, SignalSampler)
             or type(writer) is not TensorDictRoundRobinWriter
             or writer.tracks_generations
-            or self._allow_nonfinite
             or len(self._transform)
             or any(other is not self for other in storage._attached_entities_iter())
         ):
@@ -133,7 +132,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         with self._replay_lock, self._write_lock:
             sampler.attach(storage)
             start, count = writer._cursor, len(data)
-            if not write_compiled(sampler, storage._storage, data, start):
+            allowed = self._allow_nonfinite
+            if not write_compiled(sampler, storage._storage, data, start, allowed):
                 return None
             end = start + count
             index = torch.arange(start, end, device="cpu")

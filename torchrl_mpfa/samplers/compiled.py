@@ -7,13 +7,15 @@ subclasses that change a step between signals and leaves.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from ctypes import addressof
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay, above_mean, factors_by_place
@@ -23,7 +25,7 @@ from torchrl_mpfa.samplers.trees import CompiledTree
 from torchrl_mpfa.samplers.weighing import Weighing, weigh
 from torchrl_mpfa.signals import REWARD
 from torchrl_mpfa.storages.rows import WIDTH, match_rows
-from torchrl_mpfa.storages.schema import INDEX_KEY
+from torchrl_mpfa.storages.schema import INDEX_KEY, as_path
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.fused import SignalSampler
@@ -152,7 +154,13 @@ def update_compiled(
 
 
 @opaque
-def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start: int) -> bool:
+def write_compiled(
+    sampler: SignalSampler,
+    stored: Any,
+    data: TensorDict,
+    start: int,
+    allow_nonfinite: Sequence[NestedKey],
+) -> bool:
     """Write new transitions from a slot on, with their signals and the highest priority.
 
     Return False, and write nothing, for what PyTorch has to do, or find fault with.
@@ -161,14 +169,14 @@ def write_compiled(sampler: SignalSampler, stored: Any, data: TensorDict, start:
     key = table.reward_key
     columns: list[int] = []
     values: list[Tensor] = []  # Kept until they are written.
+    allowed = {as_path(entry) for entry in allow_nonfinite} - {as_path(key)}
     if (
         not sampler.compiled
         or not 0 < count <= table.capacity
-        or any(signal != REWARD or signal.key != key for signal in table.written)
+        or any(signal != replace(REWARD, key=key) for signal in table.written)
         # It is the one entry that may be absent.
         or data.get(INDEX_KEY, None) is not None
-        or not match_rows(stored, data, count, columns, values, absent=1)
-        or -1 in columns[WIDTH - 1 :: WIDTH]
+        or not match_rows(stored, data, count, columns, values, 1, allowed)
     ):
         return False
     reward, index = stored.get(key, None), stored.get(INDEX_KEY, None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torchrl_mpfa.native import address, find_loops, is_plain, opaque
 WIDTH = 4
 """Numbers of a column: addresses of what is stored and of the rows, bytes of a row, precision.
 
-Precision is 4 or 8, -1 for other floating-point numbers, and 0 for all else."""
+Precision is 4 or 8 where numbers must be finite, and 0 for all else."""
 _NUMBERS = {torch.float: 4, torch.double: 8}
 
 
@@ -81,18 +81,22 @@ def match_rows(
     columns: list[int],
     values: list[Tensor],
     absent: int = 0,
+    allowed: Container[tuple[str, ...]] | None = None,
+    path: tuple[str, ...] = (),
 ) -> bool:
     """List the columns of new rows, and the values that they point to.
 
     Return False if the rows are not of the form of the stored ones, of whose entries so many may be
-    absent.
+    absent. With entries that are ``allowed`` not to be finite, those of a precision that C does not
+    know are looked at here, and False is returned if another one is not finite.
     """
     if len(stored.keys()) != len(data.keys()) + absent:
         return False
     for key, value in data.items():
         into = stored.get(key, None)
         if type(into) is TensorDict and type(value) is TensorDict:
-            if not match_rows(into, value, count, columns, values):
+            below = (*path, key)
+            if not match_rows(into, value, count, columns, values, 0, allowed, below):
                 return False
         elif (
             isinstance(into, Tensor)
@@ -105,7 +109,12 @@ def match_rows(
             and not value.is_complex()
         ):
             values.append(value)
-            number = _NUMBERS.get(value.dtype, -1 if value.is_floating_point() else 0)
+            number = _NUMBERS.get(value.dtype, 0)
+            if allowed is not None and value.is_floating_point():
+                if (*path, key) in allowed:
+                    number = 0
+                elif not number and not bool(value.float().isfinite().all()):
+                    return False
             columns += (into.data_ptr(), value.data_ptr(), value.nbytes // count, number)
         else:
             return False
