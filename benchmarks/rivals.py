@@ -19,6 +19,7 @@ import pandas as pd
 
 from benchmarks import sparse
 from benchmarks.planned import Planned, planned_table
+from training.comparison.report import difference_table
 from training.comparison.scores import COLUMNS, runs_by_task
 from training.files import run_script
 from training.records import area_under, read_table, write_table
@@ -59,6 +60,13 @@ def make(folder: Path, kept: Path, jobs: int) -> int:
     return 0
 
 
+def mazes(kept: Path = KEPT) -> str:
+    """Return the differences of all arms in mazes, which the design kept apart: exploratory."""
+    runs = runs_by_task([kept])[f"{REGIME}, mazes"]
+    last = {arm: {seed: float(run[1][-1]) for seed, run in of.items()} for arm, of in runs.items()}
+    return difference_table({"success in mazes, exploratory": last})
+
+
 def answer(kept: Path = KEPT) -> str:
     """Return the differences that the design planned, of kept rows."""
     tasks = runs_by_task([kept])
@@ -95,7 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.kept and (status := make(options.folder, options.output, options.jobs)):
         return status
-    print("\n\n".join([*sparse.tables(options.output), answer(options.output)]))
+    tables = *sparse.tables(options.output), mazes(options.output), answer(options.output)
+    print("\n\n".join(tables))
     return 0
 
 

@@ -77,9 +77,10 @@ def said(found: Trained) -> str:
     parts = []
     for other in CLAIMS[1:]:
         differ = [measure for measure in MEASURES if corrected[measure, other] < _LEVEL]
-        which = f"a difference in {' and '.join(differ)}" if differ else "no difference"
-        parts.append(f"{which} to {NAMES[other]}")
-    return f"In the training of {seeds} seeds MPFA-PER shows {' and '.join(parts)} (exploratory)."
+        verb = "differs" if differ else "shows no difference"
+        where = f" in {' and '.join(differ)}" if differ else ""
+        parts.append(f"{verb} from {NAMES[other]}{where}")
+    return f"In the training of {seeds} seeds MPFA-PER {' and '.join(parts)} (exploratory)."
 
 
 def convergence_table(found: Trained) -> str:

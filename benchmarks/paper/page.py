@@ -80,9 +80,9 @@ seed, and was made after the figures had been seen: it is exploratory. A step is
 have the paper's 1,000 episodes and end before its 130,000 steps.
 """,
     """
-No sign was found that MPFA-PER learns faster than PER. In the last world it reaches more goals than
-uniform replay, which is the only difference left after correction. p are of the permutation test of
-signs, first as they are, then corrected together by Holm's method.
+No difference between MPFA-PER and PER is left after correction. In the last world MPFA-PER reaches
+more goals than uniform replay, which is the only difference that is left. p are of the permutation
+test of signs, first as they are, then corrected together by Holm's method.
 """,
 )
 _ERRORS = """

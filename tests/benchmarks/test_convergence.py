@@ -46,12 +46,12 @@ def test_sentence_names_only_differences_that_survive_the_correction() -> None:
     better = runs.assign(**{"reward per step": runs["reward per step"] + 3.0})
     said = convergence.said({"mpfa_per": better, "per": better, "uniform": runs})
     assert said == (
-        "In the training of 20 seeds MPFA-PER shows no difference to PER and a difference in "
-        "reward per step to uniform (exploratory)."
+        "In the training of 20 seeds MPFA-PER shows no difference from PER and differs from "
+        "uniform in reward per step (exploratory)."
     )
 
 
-def test_page_has_the_three_earlier_looks() -> None:
+def test_page_has_the_six_earlier_looks() -> None:
     page = (ROOT / "docs/results/paper.md").read_text(encoding="utf-8")
     table = next(text for text in looks() if text.startswith("|"))
     assert table in page

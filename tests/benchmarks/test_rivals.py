@@ -59,7 +59,7 @@ def test_the_tables_of_the_page_are_those_of_the_kept_rows() -> None:
     page = sparse.KEPT.with_suffix(".md").read_text(encoding="utf-8")
     arms, heading, differences = sparse.tables(rivals.KEPT)
     assert heading == "### Simple"
-    for table in (rivals.answer(), arms, differences):
+    for table in (rivals.answer(), arms, differences, rivals.mazes()):
         assert table in page
 
 
