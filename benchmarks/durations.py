@@ -7,7 +7,7 @@ An arm has ``regime=rooms`` but for what :data:`ARMS` changes: half of the actio
 duration, and as many updates, evaluations and seconds of exploration. All policies, and ``mpc``
 once, drive the same tasks on wheels. Rows are added after each seed, and runs that have rows are
 not made again: the same command continues. Tables are printed once all runs are there, or with
-``--kept``.
+``--kept``; the last one has what the design planned. A difference of times is one of logarithms.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import pandas as pd
 
 from benchmarks.paper.rows import arm_of, write_rows
 from benchmarks.paper.runs import finished, without
+from benchmarks.planned import Planned, planned_table
 from training import files
 from training.comparison.arms import Arm
 from training.comparison.execution import make_runs
@@ -160,6 +161,23 @@ def tables(kept: Path = KEPT) -> list[str]:
     return [table([*head, "mazes", "collisions"], lines), *differences]
 
 
+def answer(kept: Path = KEPT) -> str:
+    """Return the four differences that the design planned, corrected together."""
+    found = measures(read_table(kept / "tests.csv.gz"), read_table(kept / "planner.csv.gz"))
+    planned = []
+    for learner in LEARNERS:
+        short, long = (
+            found[found["arm"] == f"{learner}-{METHOD}-{arm}"] for arm in ("short", "long")
+        )
+        for measure, column in zip(_MEASURES, ("success", "log_time"), strict=True):
+            sides = (
+                dict(zip(runs["seed"].astype(str), runs[column], strict=True))
+                for runs in (long, short)
+            )
+            planned.append(Planned(f"{learner.upper()}: 0.4 s − 0.2 s", measure, *sides))
+    return planned_table(planned)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the missing runs, or print the tables; return the exit status."""
     parser = argparse.ArgumentParser(
@@ -177,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         register()
         if status := make(options.folder, options.output, options.jobs):
             return status
-    print("\n\n".join(tables(options.output)))
+    print("\n\n".join([*tables(options.output), answer(options.output)]))
     return 0
 
 

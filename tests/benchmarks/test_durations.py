@@ -62,3 +62,17 @@ def test_time_over_planner_counts_kinds_alike_and_tasks_that_both_reach(tmp_path
     assert found["success"]["td3-mpfa_per-short"] == 1.0
     [outcomes, title, _] = durations.tables(tmp_path)[:3]
     assert "| TD3 | 0.4 s | 1 | 100.00% |" in outcomes and title == "### TD3"
+
+
+def test_answer_has_the_four_planned_differences(tmp_path: Path) -> None:
+    slow, fast = [20.0, 10.0, 30.0, 9.0], [10.0, 10.0, 15.0, 9.0]
+    arms = {
+        f"{learner}-mpfa_per-{arm}": times
+        for learner in durations.LEARNERS
+        for arm, times in (("short", slow), ("long", fast))
+    }
+    write_tests(tmp_path, {**arms, "mpc": [10.0, 10.0, 15.0, 99.0]})
+    rows = [line.split(" | ") for line in durations.answer(tmp_path).splitlines()[2:]]
+    assert [row[0] for row in rows] == ["| TD3: 0.4 s − 0.2 s"] * 2 + ["| DDPG: 0.4 s − 0.2 s"] * 2
+    assert float(rows[1][2]) == pytest.approx(-np.log(np.sqrt(np.sqrt(2.0) * 2.0)), abs=5e-4)
+    assert float(rows[0][2]) == 0.0
