@@ -11,6 +11,7 @@ from mpfa_envs import Policy, export_policy
 from mpfa_envs.deploy import Card
 from mpfa_envs.policies.layers import LayerNorm, Linear, ReLU, Tanh
 from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.sensing.observation import observation_slices
 
 SHIPPED = "td3-paper"
 """A policy without a map."""
@@ -38,8 +39,12 @@ def exported(folder: Path, size: int = 24, **env_arguments: Any) -> Path:
 
 def card(**changes: Any) -> Card:
     """The card of a policy for a TurtleBot2, without a file."""
+    sensed = {"sectors": 18, "memory": "none", "history": 0} | changes
+    parts = observation_slices(
+        sensed["sectors"], memory=sensed["memory"], history=sensed["history"]
+    )
     values: dict[str, Any] = {
-        "observation_size": 24,
+        "observation_size": max(part.stop for part in parts.values()),
         "action_size": 2,
         "sectors": 18,
         "field_of_view": 180.0,
