@@ -28,11 +28,12 @@ from torch import Tensor
 from torchrl.data import RandomSampler
 from tqdm import tqdm
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
+from benchmarks.paper.methods.mw import MW
 from mpfa_envs.render.charts import finish, look, new_figure
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.checks import unknown
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
-from torchrl_mpfa.methods.catalogue import MW
 from torchrl_mpfa.methods.ref_er import ReFERSampler
 from training.files import check_folder, run_script
 
@@ -40,6 +41,8 @@ COUNT = 2_000
 BATCH_SIZE = 128
 ROUNDS = 600
 """Training steps until priorities have settled, and as many again that count."""
+PICTURED = {**METHODS, **RECONSTRUCTIONS}
+"""Methods of the package and of the paper's table."""
 REPLAY_CAP = 60
 """In place of 1,024, which so few training steps do not reach."""
 EPISODE_LENGTH = 50
@@ -160,7 +163,7 @@ def _update(
 
 def plot(name: str, path: Path) -> None:
     """Plot the figure of a method."""
-    transitions, found = count_samples(METHODS[name])
+    transitions, found = count_samples(PICTURED[name])
     figure, axes = new_figure(1, 3, panel=(2.4, 2.6))
     error = transitions.signals["td_error"].numpy()
     for number, (kind, color) in enumerate(zip(KINDS, COLORS, strict=True)):
@@ -209,15 +212,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, default=Path("docs/methods/images"))
     options = parser.parse_args(arguments)
     for name in options.methods:
-        if name not in METHODS:
-            parser.error(unknown("method", name, METHODS))
+        if name not in PICTURED:
+            parser.error(unknown("method", name, PICTURED))
     try:
         check_folder(options.output)
     except ValueError as error:
         parser.error(f"--output: {error}")
     names = options.methods or [
         name
-        for name, method in METHODS.items()
+        for name, method in PICTURED.items()
         if name not in ALIASES and not samples_uniformly(method)
     ]
     torch.set_num_threads(1)

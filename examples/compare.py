@@ -86,13 +86,17 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     from torchrl_mpfa.checks import unknown
+    from torchrl_mpfa.methods.catalogue import unknown_method
     from training.settings.train import GROUPS
 
     for group in ("method", "learner", "seed"):
         names = getattr(options, f"{group}s")
         for number, name in enumerate(names):
             if group in GROUPS and name not in GROUPS[group]:
-                parser.error(unknown(group, name, GROUPS[group]))
+                is_method = group == "method"
+                parser.error(
+                    unknown_method(name) if is_method else unknown(group, name, GROUPS[group])
+                )
             if name in names[:number]:
                 parser.error(f"--{group}s has {name} twice")
     check_least(parser, options, jobs=1, episodes=1)

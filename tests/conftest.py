@@ -56,6 +56,16 @@ def pytest_unconfigure() -> None:
 
 
 # PyTorch takes seconds to import, and of the processes of pytest-xdist the first runs no test.
+@pytest.fixture
+def reconstructed(monkeypatch):
+    """The reconstructed methods of the paper's table by name, as their plugin registers them."""
+    from benchmarks.paper.methods import RECONSTRUCTIONS
+    from torchrl_mpfa.methods import METHODS
+
+    for name, method in RECONSTRUCTIONS.items():
+        monkeypatch.setitem(METHODS, name, method)
+
+
 @pytest.fixture(autouse=True)
 def one_thread():
     """TorchRL's parallel environments leave more, and tiny operations then wait for each other."""

@@ -24,10 +24,11 @@ from benchmarks.paper.errors import figure_3, keep_figure_3
 from benchmarks.paper.page import write_page
 from benchmarks.paper.published import TABLE_3
 from benchmarks.paper.rows import FOLDER, QUESTION, keep, keep_time, read_rows
-from benchmarks.paper.runs import BLOCKS, SEEDS, comparisons, question, without
+from benchmarks.paper.runs import BLOCKS, PLUGIN_FILE, SEEDS, comparisons, question, without
 from training import files
 from training.comparison.execution import make_runs
 from training.options import check_least
+from training.plugins import load_plugin
 from training.settings.train import register
 
 TIMED = SEEDS[:3]
@@ -60,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _write(rows, options.output)
         if options.command == "keep":
             return _keep(options.folder, rows)
+        load_plugin(PLUGIN_FILE)
         register()
         make = {"time": _time, "figure3": _figure_3}.get(options.command, _make)
         return make(options.folder, rows, options.jobs)

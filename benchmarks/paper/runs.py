@@ -7,11 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.paper.published import NAMES, PHIS
+from torchrl_mpfa.methods.catalogue import PLUGIN
 from training.comparison.arms import Arm
 from training.comparison.jobs import Comparison, Job
 
 SETTINGS = ("regime=paper", "robots=16", "updates=16", "learner.compile=true", "tracking=off")
 """The paper's task and replay volume, with sixteen robots in the place of one."""
+PLUGIN_FILE = Path(__file__).parents[2] / PLUGIN
+"""It registers the reconstructed methods."""
 LETTER = Arm(
     "letter",
     ("environment.mirror=false", "environment.clearance=0.17", "exploration.varied=false"),
@@ -42,7 +45,7 @@ def comparisons(folder: Path, seeds: Sequence[int] = SEEDS) -> list[Comparison]:
         return tuple(seed for seed in seeds if seed in FEW[arm.name])
 
     return [
-        Comparison(folder, tuple(NAMES), SETTINGS, seeds),
+        Comparison(folder, tuple(NAMES), (*SETTINGS, f"plugin={PLUGIN_FILE}"), seeds),
         Comparison(folder / "phi", ("mpfa_per",), (*SETTINGS, "curriculum=A"), seeds, arms=phis),
         Comparison(folder, CLAIMS, SETTINGS, few(LETTER), ("plain",), (LETTER,)),
         Comparison(folder, CLAIMS[:2], SETTINGS, few(ONE_ROBOT), arms=(ONE_ROBOT,)),

@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import torch
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
 from benchmarks.speed.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.speed.timing import MICROSECONDS, Call, Entry, entry, take_turns
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
-from training.run.assembly import make_curiosity, make_learner
+from training.run.assembly import make_learner
 from training.settings.learners import LearnerSettings
 
 BASELINE = "ddpg"
+MEASURED = {**METHODS, **RECONSTRUCTIONS}
+"""Methods of the package and of the paper's table."""
 _FILL = 10_000
 _EPISODE = 100
 """Transitions of an episode."""
@@ -24,7 +27,7 @@ def make_step(method: Method) -> Call:
     torch.manual_seed(0)
     sizes = OBSERVATION_SIZE, ACTION_SIZE
     learner = make_learner(LearnerSettings(), method, *sizes)
-    curiosity = make_curiosity(method, *sizes)
+    bonus = method.bonus(*sizes)
     replay = make_replay(method, policy=learner.policy, sigma=_SIGMA)
     buffer = replay.buffer
     filling, transition = make_transitions(_FILL), make_transitions(1)
@@ -38,8 +41,8 @@ def make_step(method: Method) -> Call:
     def step() -> None:
         buffer.extend(transition)
         for sampled in replay.select(buffer):
-            if curiosity is not None and sampled.gives_signals:
-                curiosity(sampled.batch)
+            if bonus is not None and sampled.gives_signals:
+                bonus(sampled.batch)
             learner.update(sampled)
             if sampled.gives_signals:
                 buffer.update_tensordict_priority(sampled.batch)
@@ -49,8 +52,8 @@ def make_step(method: Method) -> Call:
 
 def measure(*, quick: bool) -> list[Entry]:
     """Compare a step of each method with one of uniform DDPG; a few methods if quick."""
-    chosen = (BASELINE, "mpfa_per", "la3p") if quick else tuple(METHODS)
-    calls = {name: make_step(replace(METHODS[name])) for name in chosen if name not in ALIASES}
+    chosen = (BASELINE, "mpfa_per", "la3p") if quick else tuple(MEASURED)
+    calls = {name: make_step(replace(MEASURED[name])) for name in chosen if name not in ALIASES}
     timings = take_turns(
         calls, rounds=3 if quick else 11, seconds=0.05 if quick else 0.3, threads=1
     )

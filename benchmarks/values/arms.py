@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
 from benchmarks.values.learning import SignalFunction, mirror
 from torchrl_mpfa.learners import ActorCritic
 from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Adjusted, Method, Prioritized, Scaled
@@ -19,7 +20,7 @@ LEFT_OUT = {
     "ddpg_radam": "it learns from other rewards, whose values are others",
     "her": "it learns for other goals, of which the buffers keep nothing",
 }
-"""Methods of the catalogue that cannot be compared here, and why."""
+"""Methods that cannot be compared here, and why."""
 AGAINST = "per"
 """Method that every arm is compared with."""
 
@@ -96,7 +97,7 @@ def _varied(base: Method, changes: dict[str, dict[str, Any]]) -> dict[str, Arm]:
 ARMS: dict[str, Arm] = {
     **{
         name: Arm(method)
-        for name, method in METHODS.items()
+        for name, method in {**METHODS, **RECONSTRUCTIONS}.items()
         if name not in LEFT_OUT and name not in ALIASES.values()
     },
     **_varied(METHODS["mpfa_per"], PARTS),
@@ -113,7 +114,7 @@ ARMS: dict[str, Arm] = {
         signals={"both_images": both_images},
     ),
 }
-"""All arms by name: the methods of the catalogue, what is changed of them, and mirrored batches."""
+"""All arms by name: the methods of package and paper, what is changed of them, mirrored batches."""
 PLANNED = ("uniform", "mpfa_per", "mpfa_plus", "mpf_per", "mpfa_per/reward", "mpfa_per/td_error")
 """Arms whose difference to :data:`AGAINST` was to be tested before the first run; all others are
 exploratory."""

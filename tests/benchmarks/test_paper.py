@@ -64,6 +64,7 @@ def made_up(folder: Path, successes: dict[str, list[float]]) -> Rows:
     return read_rows(folder)
 
 
+@pytest.mark.usefixtures("reconstructed")
 def test_comparisons_ask_for_every_run_that_is_planned() -> None:
     planned = [job for each in comparisons(Path("runs/paper")) for job in each.jobs]
     assert len({job.path for job in planned}) == len(planned) == 130 + 30 + 15 + 6

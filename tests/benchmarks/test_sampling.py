@@ -10,11 +10,11 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from benchmarks import sampling
-from benchmarks.sampling import COLORS, KINDS, count_samples, main, samples_uniformly
-from torchrl_mpfa.methods import ALIASES, METHODS
+from benchmarks.sampling import COLORS, KINDS, PICTURED, count_samples, main, samples_uniformly
+from torchrl_mpfa.methods import ALIASES
 
 DOCS = Path(__file__).parents[2] / "docs" / "methods"
-NAMES = sorted(set(METHODS) - set(ALIASES))
+NAMES = sorted(set(PICTURED) - set(ALIASES))
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
-    transitions, found = count_samples(METHODS[name])
+    transitions, found = count_samples(PICTURED[name])
     return {
         kind: float(found[who][transitions.kind == number].mean())
         for number, kind in enumerate(KINDS)
@@ -32,7 +32,7 @@ def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
 
 
 def test_per_favors_large_errors_and_mpfa_per_goals_as_well() -> None:
-    transitions, found = count_samples(METHODS["per"])
+    transitions, found = count_samples(PICTURED["per"])
     error = transitions.signals["td_error"].numpy()
     high = error > np.median(error)
     assert found["critic"][high].mean() > 1.3 * found["critic"][~high].mean()
@@ -42,19 +42,19 @@ def test_per_favors_large_errors_and_mpfa_per_goals_as_well() -> None:
 
 
 def test_la3p_gives_the_actor_small_errors_and_the_critic_large_ones() -> None:
-    transitions, found = count_samples(METHODS["la3p"])
+    transitions, found = count_samples(PICTURED["la3p"])
     error = transitions.signals["td_error"].numpy()
     large = error > np.quantile(error, 0.95)
     assert found["critic"][large].mean() > 1.1 > 0.97 > found["actor"][large].mean()
 
 
 def test_combined_replay_has_the_newest_in_every_batch() -> None:
-    _, found = count_samples(METHODS["cer"])
+    _, found = count_samples(PICTURED["cer"])
     assert found["critic"].argmax() == len(found["critic"]) - 1
 
 
 def test_a_reliable_error_is_sampled_more_often_than_one_early_in_its_episode() -> None:
-    _, found = count_samples(METHODS["reaper"])
+    _, found = count_samples(PICTURED["reaper"])
     by_step = found["critic"].reshape(-1, sampling.EPISODE_LENGTH).mean(0)
     assert by_step[-10:].mean() > 1.2 * by_step[:10].mean()
 
@@ -91,7 +91,7 @@ def test_every_method_has_a_page_with_its_source_and_a_figure_unless_it_is_unifo
     name: str,
 ) -> None:
     page = page_of(name)
-    pictured = not samples_uniformly(METHODS[name])
+    pictured = not samples_uniformly(PICTURED[name])
     assert (f"(images/{name}.png)" in page) == pictured
     assert (DOCS / "images" / f"{name}.png").exists() == pictured
     shared = f"## `{name}`\n" in page

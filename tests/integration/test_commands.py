@@ -129,6 +129,7 @@ def understand(words: Sequence[str]) -> None:
         assert len(parse_worlds(known)) >= len(known)
 
 
+@pytest.mark.usefixtures("reconstructed")
 def test_every_command_on_the_pages_is_understood(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -136,13 +137,14 @@ def test_every_command_on_the_pages_is_understood(
     best = tmp_path / "runs/tune/best.yaml"
     best.parent.mkdir(parents=True)
     best.write_text("learner.tau: 0.01\n")
-    for name in ("docs", "examples"):
+    for name in ("benchmarks", "docs", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     # A page names a plugin, which registers a method.
     Path("mine.py").write_text("")
     monkeypatch.setitem(METHODS, "mine", Scaled("mine", signals=["td_error"]))
-    monkeypatch.setitem(sys.modules, "mine", None)  # Leaves with the test.
+    for name in ("mine", "reconstructions"):
+        monkeypatch.setitem(sys.modules, name, None)  # Leaves with the test.
     parse = argparse.ArgumentParser.parse_args
 
     def parsed(self: argparse.ArgumentParser, *arguments: Any) -> None:

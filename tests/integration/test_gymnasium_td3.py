@@ -76,11 +76,12 @@ def test_what_the_page_cannot_do_is_rejected_before_it_trains(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("reconstructed")
 def test_methods_that_ask_for_more_than_a_buffer_and_a_loss_are_named_by_what_they_ask() -> None:
     beside = {name: method.beside for name, method in METHODS.items() if method.beside}
     assert beside == {
-        "averaged_ddpg": ("target_average",),
-        "ddpg_radam": ("curiosity", "optimizer"),
+        "averaged_ddpg": ("learner",),
+        "ddpg_radam": ("bonus", "learner"),
         "her": ("hindsight", "episode"),
         "klper": ("policy", "sigma"),
         "reaper": ("episode",),

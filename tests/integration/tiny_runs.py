@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
 from training.run.checkpoints import read_checkpoint
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
@@ -46,7 +47,7 @@ def tiny(
     updates: int = 1,
 ) -> TrainSettings:
     settings = TrainSettings(
-        method=replace(GROUPS["method"][method]),
+        method=replace((GROUPS["method"] | RECONSTRUCTIONS)[method]),
         learner=GROUPS["learner"][learner](),
         curriculum=CurriculumSettings("tiny", list(episodes or STAGES)),
         environment=EnvironmentSettings(physics="kinematic", max_steps=14),

@@ -17,20 +17,15 @@ from torchrl_mpfa.methods import (
     loss_options,
     make_replay,
 )
-from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
 
 NAN = float("nan")
 
 
-def more(name):
-    """Further arguments of KLPER and ReF-ER."""
-    asks = name in {"klper", "ref_er"}
-    return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if asks else {}
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
-    replay = make_replay(name, capacity=64, batch_size=8, generator=seeded(0), **more(name))
+    replay = make_replay(
+        name, capacity=64, batch_size=8, generator=seeded(0), policy=make_actor(6, 2, width=8)
+    )
     assert isinstance(replay.buffer, SignalReplayBuffer)
     assert replay.method.name == ALIASES.get(name, name) or name in ALIASES
     assert replay.signals == tuple(loss_options(name)["signals"])
@@ -114,11 +109,9 @@ def test_exponent_of_pal_is_that_of_the_method():
         ({"batch_size": 2.5}, "batch_size must be an integer from 1 to 2147483647, got 2.5"),
         ({"alpha": -1.0}, "alpha must be finite and not negative, got -1.0"),
         ({"method": "lap", "priority_floor": -1}, "priority_floor must be positive and finite"),
-        ({"method": "hvper", "replay_penalty": -1}, "replay_penalty must be finite and not neg"),
         ({"method": "reaper", "reliability": -1}, "reliability must be positive and finite"),
         ({"boost": "x"}, "boost must be true or false, got 'x'"),
         ({"beta_end": NAN}, r"beta_end must be in \[0, 1\], got nan"),
-        ({"method": "ddpg_radam", "curiosity": -1}, "curiosity must be positive and finite"),
         ({"boost_target": -1}, r"boost_target must be in \[0, 1\), got -1"),
         ({"positive_above": NAN}, "positive_above must be a finite number or 'mean', got nan"),
         ({"weight_floor": 1.0}, r"weight_floor must be in \[0, 1\), got 1.0"),
@@ -126,8 +119,8 @@ def test_exponent_of_pal_is_that_of_the_method():
         ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
         ({"method": "her", "hindsight": -1}, "hindsight must be an integer from 0"),
         ({"method": "reaper", "hindsight": 2}, "hindsight must be 0 with reaper, which .* got 2"),
-        ({"method": "klper"}, "method 'klper' needs policy and sigma"),
-        ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
+        ({"method": "ref_er"}, "method 'ref_er' needs policy: it compares actions with its own"),
+        ({"method": "klper"}, "method 'klper' comes with a plugin: add --plugin benchmarks/paper"),
         ({"method": 3}, "method must be a name or a Method, got 3"),
         ({"beta": "x"}, "beta must be a number, got 'x'"),
         ({"alpha": None}, "alpha must be a number, got None"),
@@ -138,17 +131,13 @@ def test_bad_setting_is_rejected_in_one_sentence(arguments, message):
         make_replay(**arguments)
 
 
-def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
-    replay = make_replay("hvper", capacity=100, batch_size=4)
-    sampler, betas, weights = replay.buffer.sampler, [], []
-    names = [RELATIVE_VALUE.name, RELATIVE_ERROR.name]
+def test_annealing_raises_beta_to_its_end():
+    replay = make_replay("per", capacity=100, batch_size=4)
+    betas, method = [], replay.method
     for fraction in (0.0, 0.5, 1.0):
         replay.anneal(fraction)
-        betas.append(sampler.beta)
-        weights.append(sampler.fusion.weights(names, None, None).tolist())
-    method = replay.method
+        betas.append(replay.buffer.sampler.beta)
     assert betas == [method.beta, (method.beta + method.beta_end) / 2, method.beta_end]
-    assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
 
 
 @pytest.mark.parametrize("name", ["uniform", "pal", "cer"])

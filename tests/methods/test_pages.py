@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 
 PAGES = Path(__file__).resolve().parents[2] / "docs/methods"
@@ -30,7 +31,7 @@ def test_the_examples_of_the_page_run_in_their_order(monkeypatch):
 def test_every_method_has_a_row_and_a_page_or_a_section_of_one():
     table = (PAGES / "README.md").read_text(encoding="utf-8")
     links = dict(re.findall(r"^\| \[`(\w+)`\]\((\S+?)\)", table, re.MULTILINE))
-    assert set(links) == set(METHODS) - set(ALIASES)
+    assert set(links) == {*METHODS, *RECONSTRUCTIONS} - set(ALIASES)
     for name, link in links.items():
         page, _, section = link.partition("#")
         title = f"## `{section}`" if section else f"# `{name}`"

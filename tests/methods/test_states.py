@@ -6,6 +6,7 @@ import pickle
 import pytest
 import torch
 
+from benchmarks.paper.methods import RECONSTRUCTIONS
 from tests.mpfa.transitions import MISSING, make_transitions, rejected, restore, same, seeded, spoil
 from torchrl_mpfa import MPFASampler, SignalMemmapStorage, make_actor
 from torchrl_mpfa.methods import METHODS as ALL
@@ -17,7 +18,8 @@ METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer", "geometric"]
 
 def make_trained(name, *, seed=0, capacity=12):
     own = {"replay_cap": 2} if name == "mw" else {}
-    replay = make_replay(name, capacity=capacity, batch_size=4, generator=seeded(seed), **own)
+    method = RECONSTRUCTIONS.get(name, name)
+    replay = make_replay(method, capacity=capacity, batch_size=4, generator=seeded(seed), **own)
     replay.buffer.extend(make_transitions(9, seed=seed))
     for _ in range(4):
         for sampled in replay.select(replay.buffer):
@@ -131,7 +133,7 @@ def test_uniform_buffer_rejects_the_state_of_a_prioritized_one(method, message):
 @pytest.mark.parametrize("name", ALL)
 def test_replay_of_every_method_is_pickled_and_copied(name, way):
     actor = make_actor(3, 2, width=8)
-    more = {"klper": {"policy": actor, "sigma": 0.2}, "ref_er": {"policy": actor}}.get(name, {})
+    more = {"ref_er": {"policy": actor}}.get(name, {})
     replay = make_replay(name, capacity=16, batch_size=4, generator=seeded(), **more)
     rows = make_transitions(12)
     rows["observation"] = torch.rand(12, 3, generator=seeded(1))

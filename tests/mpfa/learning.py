@@ -8,6 +8,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss, ValueEstimators
 
+from benchmarks.paper.methods.averaged_ddpg import AveragedLearner
+from benchmarks.paper.methods.ddpg_radam import RAdamLearner
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import (
     DQN,
@@ -48,12 +50,23 @@ def without_shortcut(actor, critic):
     return ProbabilisticActor(inner, keys, spec=spec, distribution_class=TanhNormal), critic
 
 
+class Both(AveragedLearner, RAdamLearner):
+    """A learner with averaged targets and RAdam."""
+
+
+def kind_of(options):
+    """The class of learners that have these options."""
+    averaged, other = "target_average" in options, "optimizer" in options
+    kinds = {(True, True): Both, (True, False): AveragedLearner, (False, True): RAdamLearner}
+    return kinds.get((averaged, other), ActorCritic)
+
+
 def make_learner(kind="ddpg", seed=0, *, networks=None, **options):
     """A learner of any kind."""
     if networks is None:
         networks = make_networks(seed, stochastic=kind == "sac")
     given = {"gamma": GAMMA, "actor_lr": 1e-3, "critic_lr": 1e-3, **OF_KIND[kind], **options}
-    return ActorCritic(*networks, **given)
+    return kind_of(options)(*networks, **given)
 
 
 def make_apart(kind="ddpg", **options):

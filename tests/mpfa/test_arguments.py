@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from benchmarks.paper.methods.hvper import ScheduledFusion
 from tests.mpfa.transitions import make_buffer
 from torchrl_mpfa import (
     ActorCritic,
@@ -27,7 +28,6 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.checks import ABOVE_ZERO, BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
-from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.samplers import TreeSampler
 from torchrl_mpfa.signals import as_signals

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from benchmarks.paper.methods.hvper import ScheduledFusion
 from tests import oracles
 from tests.mpfa.transitions import make_filled, make_transitions, seeded, train_rounds
 from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion, ScaledFusion
@@ -15,7 +16,6 @@ from torchrl_mpfa.fusion import (
     positive_entropy,
     reward_entropy,
 )
-from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.samplers import SignalTable
 
 NAMES = ["td_error", "action_gradient", "reward"]

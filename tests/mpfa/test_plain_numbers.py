@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.paper.methods.hvper import HVPERPenalty, ScheduledFusion
+from benchmarks.paper.methods.klper import KLPERSelection
+from benchmarks.paper.methods.mw import MWSampler
 from tests.mpfa.learning import make_discrete, make_learner, make_networks
 from tests.mpfa.transitions import make_filled
 from torchrl_mpfa import (
@@ -20,10 +23,7 @@ from torchrl_mpfa import (
 from torchrl_mpfa.checks import COUNT, SHARE, check
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.geometric import GeometricSampler
-from torchrl_mpfa.methods.hvper import HVPERPenalty, ScheduledFusion
-from torchrl_mpfa.methods.klper import KLPERSelection
 from torchrl_mpfa.methods.lap import LAPFloor
-from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSelection
 

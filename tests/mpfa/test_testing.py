@@ -3,6 +3,14 @@
 import pytest
 import torch
 
+from benchmarks.paper.methods.hvper import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    HVPERPenalty,
+    ScheduledFusion,
+    value_schedule,
+)
+from benchmarks.paper.methods.mw import MWSampler
 from torchrl_mpfa import (
     Adjustment,
     EntropyFusion,
@@ -14,16 +22,8 @@ from torchrl_mpfa import (
     ScaledFusion,
     SignalSampler,
 )
-from torchrl_mpfa.methods.hvper import (
-    RELATIVE_ERROR,
-    RELATIVE_VALUE,
-    HVPERPenalty,
-    ScheduledFusion,
-    value_schedule,
-)
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.lap import LAPFloor
-from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.testing import check_sampler
 

@@ -160,7 +160,7 @@ def test_every_method_makes_as_many_updates_and_gives_log_and_batch(name):
     assert {"loss_value", "loss_actor", "td_error"} <= log.keys()
     for signal in replay.signals:
         assert batch["signals", signal].shape == batch.batch_size
-    if name in {"mpfa_per", "per", "lap", "hvper", "rank_per", "mw"}:
+    if name in {"mpfa_per", "per", "lap", "rank_per"}:
         weight = batch["priority_weight"]
         assert weight.shape == (BATCH,) and bool((weight > 0).all())
         assert replay.buffer.sampler.weights
@@ -170,6 +170,7 @@ def newest_in(batch):
     return batch["index"][0].item() == 199
 
 
+@pytest.mark.usefixtures("reconstructed")
 @pytest.mark.parametrize(
     ("name", "settings", "calls"),
     [

@@ -22,14 +22,13 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
 from torchrl_mpfa.learners.compiled import CompiledUpdate
 from torchrl_mpfa.learners.networks import (
-    PastCritics,
     Tensors,
     as_function,
     check_networks,
     several,
     with_quantiles,
 )
-from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
+from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner
 from torchrl_mpfa.losses import (
     DISTANCES,
     LEAST_NOISE,
@@ -110,15 +109,11 @@ class ActorCritic(OptimizedLearner):
         saturation_penalty: Factor of the mean of :math:`\max(0, |u| - l)^2`, added to the actor's
             loss, where :math:`u` is the (mean) action before its tanh (``"preactivation"``).
         saturation_limit: The limit :math:`l`.
-        target_average: Number of critics in the mean of the target: the target critic and its
-            states at the ends of the last episodes; 1 is Eq. (5).
         actor_lr: Learning rate of the actor, Table 1.
         critic_lr: Learning rate of the critics, Table 1.
         critic_weight_decay: L2 decay of the critics' weights. A decay of 1e-2, as in the original
             DDPG paper, was seen to hold Q below the returns.
         tau: :math:`\tau` of Eqs. (6)-(7), Table 1.
-        optimizer: ``"adam"`` (the paper), or ``"radam"``, which warms up by itself (Liu et al.
-            2020, https://arxiv.org/abs/1908.03265).
         compile: True to make one program of an update by ``torch.compile``, or the arguments for
             it. It needs a C++ compiler and half a minute once (the program is kept on disk), and
             takes half of the time for networks of 64 units. The networks must stay on their device.
@@ -163,12 +158,10 @@ class ActorCritic(OptimizedLearner):
         reward_scale: float = 1.0,
         saturation_penalty: float = 0.0,
         saturation_limit: float = 1.5,
-        target_average: int = 1,
         actor_lr: float = 1e-4,
         critic_lr: float = 1e-4,
         critic_weight_decay: float = 1e-4,
         tau: float = 0.01,
-        optimizer: OptimizerName = "adam",
         compile: bool | dict[str, Any] = False,
     ) -> None:
         check_networks(actor, critic)
@@ -204,10 +197,9 @@ class ActorCritic(OptimizedLearner):
                 f"saturation_penalty is {saturation_penalty}, but actor writes no 'preactivation'"
             )
         smooths = self.policy_noise > 0
-        count, self.policy_delay, averaged = check_counts(
+        count, self.policy_delay = check_counts(
             critics=(2 if self.stochastic or smooths else 1) if critics is None else critics,
             policy_delay=(2 if smooths else 1) if policy_delay is None else policy_delay,
-            target_average=target_average,
         )
         self.target_entropy = target_entropy
         if target_entropy is not None:
@@ -238,9 +230,7 @@ class ActorCritic(OptimizedLearner):
             networks["temperature"] = nn.ParameterDict({"log": self._log_alpha})
             groups += [{"params": [self._log_alpha], "lr": alpha_lr}] if alpha_lr > 0 else []
         targets.requires_grad_(False)
-        if averaged > 1:
-            networks["past"] = PastCritics(targets["critics"], averaged - 1).to(device)
-        super().__init__(networks, targets, groups, optimizer, tau)
+        super().__init__(networks, targets, groups, tau)
         self.policy: TensorDictModule = actor
         self._actor_parameters = [*actor.parameters()]
         self._critic_keys = [key for key in critic.in_keys if key != "action"]
@@ -338,21 +328,9 @@ class ActorCritic(OptimizedLearner):
         return torch.stack([self._value(critic, stored, batch["action"]) for critic in critics])
 
     def _target_values(self, states: Tensors, action: Tensor) -> Tensor:
-        """Compute each target critic's Q, ``[C, B]``, or its mean with earlier states."""
-        critics = [*self.targets["critics"]]
-        if "past" not in self.networks:
-            return torch.stack([self._value(critic, states, action) for critic in critics])
-        past = self.networks["past"]
-        sets = [*past.states, critics]
-        values = [
-            [self._value(critic, states, action) for critic in critics_then]
-            for critics_then in sets
-        ]
-        means = [
-            torch.tensordot(past.share, torch.stack(of_critic), dims=1)
-            for of_critic in zip(*values, strict=True)
-        ]
-        return torch.stack(means)
+        """Compute each target critic's Q, ``[C, B]``."""
+        critics = self.targets["critics"]
+        return torch.stack([self._value(critic, states, action) for critic in critics])
 
     # The actor.
 
@@ -418,8 +396,3 @@ class ActorCritic(OptimizedLearner):
         if self.importance == "torchrl":
             return (losses * weight).sum() / weight.sum()
         return (losses * weight).mean()
-
-    def end_episode(self) -> None:
-        """Keep the target critics' present state, if the target averages several of them."""
-        if "past" in self.networks:
-            self.networks["past"].push(self.targets["critics"])

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner, OptimizerName
+from torchrl_mpfa.learners.optimized import IMPORTANCE, OptimizedLearner
 from torchrl_mpfa.losses import distance, read_choices, target_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import td_error_priority
@@ -53,7 +53,6 @@ class DQN(OptimizedLearner):
         lr: Learning rate.
         weight_decay: L2 decay of the weights.
         tau: Share of the network in the target network's step.
-        optimizer: ``"adam"`` or ``"radam"``.
 
     Raises:
         TypeError: If the network is no :class:`DirectModule`.
@@ -79,7 +78,6 @@ class DQN(OptimizedLearner):
         lr: float = 1e-4,
         weight_decay: float = 0.0,
         tau: float = 0.01,
-        optimizer: OptimizerName = "adam",
     ) -> None:
         if not isinstance(network, DirectModule):
             raise TypeError(f"network must be a DirectModule, got {type(network).__name__}")
@@ -101,7 +99,7 @@ class DQN(OptimizedLearner):
         groups = [{"params": [*network.parameters()], "lr": lr, "weight_decay": decay}]
         target = copy.deepcopy(network).requires_grad_(False)
         networks, targets = nn.ModuleDict({"value": network}), nn.ModuleDict({"value": target})
-        super().__init__(networks, targets, groups, optimizer, tau)
+        super().__init__(networks, targets, groups, tau)
         self.policy: DirectModule = network
 
     def _differentiate(

@@ -81,43 +81,6 @@ def several(critic: nn.Module, count: int) -> list[nn.Module]:
     return critics
 
 
-# The mean of several earlier critics, whose targets vary less than those of one. Averaged-DQN
-# (Anschel et al. 2017, https://arxiv.org/abs/1611.01929) averages the last K target networks;
-# Averaged-DDPG (Xu et al. 2022, Computers and Electrical Engineering 101, 108015) does so for DDPG.
-# A reconstruction: of the latter a summary says that the mean of K earlier estimates is the
-# target's value, and that it changes at the end of an episode. Here the target critic of Eq. (7) is
-# the newest of the K, and the others are its states at the ends of the last episodes, so that K = 1
-# is DDPG.
-
-
-class PastCritics(nn.Module):
-    """Critics as they were at the last ``count`` calls of :meth:`push`."""
-
-    share: Tensor
-    taken: Tensor
-
-    def __init__(self, critics: nn.ModuleList, count: int) -> None:
-        super().__init__()
-        self.states = nn.ModuleList(deepcopy(critics) for _ in range(count))
-        self.register_buffer("taken", torch.zeros((), dtype=torch.long))
-        # Of the states, and last of the critics themselves: all that exist count the same. A
-        # compiled update has them all, so that it need not be made again with each.
-        self.register_buffer("share", torch.zeros(count + 1))
-        self.share[-1] = 1.0
-
-    @torch.no_grad()
-    def push(self, critics: nn.ModuleList) -> None:
-        """Replace the oldest state by the critics' present one."""
-        oldest = self.states[int(self.taken) % len(self.states)]
-        for old, value in zip(oldest.parameters(), critics.parameters(), strict=True):
-            old.copy_(value)
-        self.taken += 1
-        count = min(int(self.taken), len(self.states))
-        self.share.zero_()
-        self.share[:count] = 1.0 / (count + 1)
-        self.share[-1] = 1.0 / (count + 1)
-
-
 # The network of UPER, which learns how noisy targets are.
 
 

@@ -10,7 +10,7 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +23,6 @@ from torchrl_mpfa.learners.compiled import CompiledUpdate, Step
 from torchrl_mpfa.saving import check_saved_numbers
 from torchrl_mpfa.selection import SampledBatch, Trains, as_sampled
 
-OptimizerName = Literal["adam", "radam"]
 IMPORTANCE: Rule = (
     lambda use: use in ("critic", "torchrl", "none"),
     "'critic', 'torchrl' or 'none'",
@@ -80,7 +79,6 @@ class OptimizedLearner:
         networks: nn.ModuleDict,
         targets: nn.ModuleDict,
         groups: list[dict[str, Any]],
-        optimizer: OptimizerName,
         tau: float,
     ) -> None:
         self.tau = check(ABOVE_ZERO, tau=tau)
@@ -88,12 +86,16 @@ class OptimizedLearner:
         """Networks by name, of ``ActorCritic`` ``"actor"`` and ``"critics"``."""
         self.targets: Any = targets
         """Target networks by the names of the networks that they follow."""
-        self.optimizer = make_optimizer(optimizer, groups)
+        self.optimizer = self.make_optimizer(groups)
         self._rates = [group["lr"] for group in groups]
         self._program: CompiledUpdate | None = None
         self.updates = 0
         """Training steps taken."""
         self._flatten()
+
+    def make_optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """Make the optimizer; a learner with another one overrides it."""
+        return FlatAdam(groups)
 
     def _flatten(self) -> None:
         """Make the parameters of a group views of one tensor, and their targets of another."""
@@ -287,15 +289,6 @@ class OptimizedLearner:
         # PyTorch would share the tensors with the owner of the state.
         self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
         self.updates = state_dict["updates"]
-
-
-def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-    """Make the optimizer of this name, which steps all tensors in one call."""
-    if name == "adam":
-        return FlatAdam(groups)
-    if name == "radam":
-        return torch.optim.RAdam(groups, foreach=True)
-    raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
 
 
 # What is wrong with a batch, a loss or a saved state, and where.

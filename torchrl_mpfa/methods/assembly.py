@@ -82,17 +82,17 @@ def make_replay(
         storage: Storage of the transitions; by default a new
             :class:`~torchrl_mpfa.SignalTensorStorage`. It must keep the signals of the method.
         device: Device of a new storage; ``"auto"``: that of the first transition.
-        policy: The policy in training, whose actions KLPER and ReF-ER compare.
-        sigma: Standard deviation of the exploration noise in units of the action, for KLPER; or a
-            function that returns that of the current episode.
+        policy: The policy in training, whose actions ReF-ER compares.
+        sigma: Standard deviation of the exploration noise in units of the action, or a function
+            that returns that of the current episode; for methods that ask for it.
         **settings: Other values for the settings of the method.
 
     Returns:
         The replay.
 
     Raises:
-        ValueError: If a method, a setting or its value is unknown or out of its range, or if KLPER
-            gets no ``policy`` or ``sigma``.
+        ValueError: If a method, a setting or its value is unknown or out of its range, or if a
+            method that needs ``policy`` or ``sigma`` gets none.
         TypeError: If the storage keeps no signals.
 
     Examples:
@@ -133,8 +133,8 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         method: A name, or a method of your own.
 
     Returns:
-        ``signals`` without the registered ones, ``importance``, ``loss_function``,
-        ``target_average`` and ``pal_alpha``.
+        ``signals`` without the registered ones, ``importance``, ``loss_function`` and
+        ``pal_alpha``, and those that the class of the method's learner has beyond these.
 
     Raises:
         ValueError: If the method is unknown.
@@ -148,8 +148,8 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         "signals": [name for name in learned_signals(chosen) if name not in SIGNALS],
         "importance": chosen.importance,
         "loss_function": chosen.loss_function,
-        "target_average": chosen.target_average,
         "pal_alpha": chosen.pal_alpha,
+        **chosen.learner_options(),
     }
 
 

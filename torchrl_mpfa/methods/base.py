@@ -57,8 +57,6 @@ class Method:
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     loss_function: str = one_of("l2", "smooth_l1", "pal")
     """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``."""
-    optimizer: str = one_of("adam", "radam")
-    """``adam`` or ``radam``."""
     hindsight: int = within(COUNT_OR_ZERO, 0)
     """Goals for which each episode is learned from once more (HER); 0: none."""
     update_block: int = within(COUNT, 1)
@@ -74,11 +72,8 @@ class Method:
     """Reason why the method needs these arguments."""
     needs_actor: ClassVar[bool] = False
     """True if the method is only for learners with an actor."""
-    # A method that can change one of these has a setting of its name.
-    target_average = 1
-    """Critics of which the target is the mean."""
-    curiosity = 0.0
-    """Factor of the bonus for outcomes that the robot could not predict (ICM); 0: none."""
+    learner: ClassVar[str] = "torchrl_mpfa.ActorCritic"
+    """Class of the learner with an actor, by its full name."""
 
     def __post_init__(self) -> None:
         keep(self, **rules_of(type(self)))
@@ -107,10 +102,13 @@ class Method:
             >>> METHODS["her"].beside, METHODS["per"].beside
             (('hindsight', 'episode'), ())
         """
-        plain = {"optimizer": "adam", "update_block": 1, "target_average": 1}
-        asked = [name for name in ("hindsight", "curiosity") if getattr(self, name)]
-        asked += [name for name, value in plain.items() if getattr(self, name) != value]
-        return (*asked, *self.needs, *self.entries)
+        asked = {
+            "hindsight": self.hindsight > 0,
+            "bonus": type(self).bonus is not Method.bonus,
+            "update_block": self.update_block != 1,
+            "learner": self.learner != Method.learner,
+        }
+        return (*filter(asked.get, asked), *self.needs, *self.entries)
 
     @property
     def remote(self) -> bool:
@@ -128,6 +126,18 @@ class Method:
     def sampler_options(self) -> dict[str, Any]:
         """Return the arguments of the sampler's class, beyond those of all prioritized ones."""
         return {}
+
+    def learner_options(self) -> dict[str, Any]:
+        """Return the arguments of the learner's class, beyond those of all methods."""
+        return {}
+
+    def bonus(self, observation_size: int, action_size: int) -> Any:
+        """Make what adds a bonus to the rewards of a batch before the learner; None: no bonus.
+
+        It is a module: called with a batch, it returns values for the log. Its ``checkpoint()`` is
+        saved with a run, and its ``restore(state)`` called when that resumes.
+        """
+        return None
 
     def sampler(self) -> SignalSampler | RandomSampler:
         """Make the sampler."""
@@ -182,12 +192,9 @@ class Prioritized(Method):
 
     def priority_signals(self) -> list[Signal]:
         """Return the signals of the priority; an unknown name is a signal of the loss."""
-        from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
         from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 
-        by_name = {
-            signal.name: signal for signal in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)
-        }
+        by_name = {signal.name: signal for signal in MPFA_SIGNALS}
         return [by_name.get(name) or Signal(name) for name in self.signals]
 
     def fusion(self) -> Fusion:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import BELOW_ONE, COUNT, LEVEL, NOT_NEGATIVE, POSITIVE, SHARE, unknown
+from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, POSITIVE, SHARE, unknown
 from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
 
 if TYPE_CHECKING:
@@ -102,51 +102,6 @@ class Scaled(Adjusted):
         from torchrl_mpfa.fusion import ScaledFusion
 
         return ScaledFusion(super().fusion())
-
-
-@dataclass
-class MW(Prioritized):
-    """Reward and TD error in equal shares, with a cap on replays (MW-MADDPG)."""
-
-    kind: ClassVar[str] = "torchrl_mpfa.methods.mw.MWSampler"
-
-    name: str = "mw"
-    signals: list[str] = field(default_factory=lambda: ["reward", "td_error"])
-    replay_cap: int = within(COUNT, 1024)
-    """Replays after which a transition is excluded."""
-
-    def fusion(self) -> Fusion:
-        """Make the fusion in equal shares."""
-        from torchrl_mpfa.fusion import ScaledFusion
-
-        return ScaledFusion(super().fusion())
-
-    def sampler_options(self) -> dict[str, Any]:
-        """Return the cap."""
-        return {"replay_cap": self.replay_cap}
-
-
-@dataclass
-class HVPER(Prioritized):
-    """Places of Q value and TD error in the batch, with a schedule and a penalty on replays."""
-
-    name: str = "hvper"
-    signals: list[str] = field(default_factory=lambda: ["relative_value", "relative_td_error"])
-    eps: float = 0.01
-    replay_penalty: float = within(NOT_NEGATIVE, 0.25)
-    """Penalty on replays."""
-
-    def fusion(self) -> Fusion:
-        """Make the fusion with a schedule."""
-        from torchrl_mpfa.methods.hvper import value_schedule
-
-        return value_schedule()
-
-    def adjustments(self) -> list[Adjustment]:
-        """Make the penalty."""
-        from torchrl_mpfa.methods.hvper import HVPERPenalty
-
-        return [HVPERPenalty(penalty=self.replay_penalty, floor=self.eps)]
 
 
 @dataclass
@@ -283,29 +238,6 @@ class UniformHalves(Method):
 
 
 @dataclass
-class KLPER(Method):
-    """The most on-policy one of several uniform batches."""
-
-    name: str = "klper"
-    candidates: int = within(COUNT, 3)
-    """Batches of which the most on-policy one is trained on."""
-    needs: ClassVar[tuple[str, ...]] = ("policy", "sigma")
-    why: ClassVar[str] = "it chooses on-policy batches"
-    needs_actor: ClassVar[bool] = True
-
-    @property
-    def rows(self) -> int:
-        """Transitions of all candidates."""
-        return self.batch_size * self.candidates
-
-    def selection(self, policy: Any, sigma: Any) -> Selection:
-        """Make the selection of the nearest candidate."""
-        from torchrl_mpfa.methods.klper import KLPERSelection
-
-        return KLPERSelection(policy, batches=self.candidates, sigma=sigma).select
-
-
-@dataclass
 class ReFER(Method):
     """Uniform replay of transitions that are near to the policy (ReF-ER)."""
 
@@ -332,27 +264,6 @@ class ReFER(Method):
         return ReFERSelection(policy, far_share=self.far_share, cutoff=self.far_cutoff)
 
 
-@dataclass
-class AveragedDDPG(Method):
-    """Uniform replay, with the mean of earlier critics as the target."""
-
-    name: str = "averaged_ddpg"
-    target_average: int = within(COUNT, 5)
-    """Critics of which the target is the mean, one more kept at each end of an episode."""
-    needs_actor: ClassVar[bool] = True
-
-
-@dataclass
-class Curious(Prioritized):
-    """PER with RAdam, and a bonus for outcomes that the robot could not predict (ICM)."""
-
-    name: str = "ddpg_radam"
-    optimizer: str = "radam"
-    curiosity: float = within(POSITIVE, 0.01)
-    """eta: factor of the bonus."""
-    needs_actor: ClassVar[bool] = True
-
-
 METHODS: dict[str, Method] = {
     # The paper's method, and its ablations.
     "mpfa_per": MPFA(),
@@ -366,13 +277,8 @@ METHODS: dict[str, Method] = {
     "decay": Adjusted("decay", decay=True),
     # What the paper compares with.
     "ddpg": Method("ddpg"),
-    "klper": KLPER(),
-    "averaged_ddpg": AveragedDDPG(),
-    "hvper": HVPER(),
     "ref_er": ReFER(),
     "rud": Method("rud", update_block=1000),
-    "ddpg_radam": Curious(),
-    "mw": MW(),
     # What else there is today.
     "rank_per": RankPER(),
     "reaper": ReaPER(),
@@ -393,6 +299,25 @@ ALIASES = {"uniform": "ddpg"}
 """Second names, which pages and figures leave out."""
 
 
+RECONSTRUCTED = ("klper", "averaged_ddpg", "hvper", "ddpg_radam", "mw")
+"""Methods that come with a plugin of the repository."""
+PLUGIN = "benchmarks/paper/methods/reconstructions.py"
+"""Path of this plugin in the repository."""
+
+
+def unknown_method(name: str) -> str:
+    """Return the error of an unknown method; of a reconstruction, with the plugin that has it.
+
+    Examples:
+        >>> unknown_method("mpfa-per")
+        "unknown method 'mpfa-per': did you mean 'mpfa_per'?"
+    """
+    if name not in RECONSTRUCTED:
+        return unknown("method", name, METHODS)
+    module = PLUGIN.removesuffix(".py").replace("/", ".")
+    return f"method {name!r} comes with a plugin: add --plugin {PLUGIN}, in Python import {module}"
+
+
 def method_named(method: str | Method, **settings: Any) -> Method:
     """Return a method with some of its settings changed.
 
@@ -410,7 +335,7 @@ def method_named(method: str | Method, **settings: Any) -> Method:
     """
     if isinstance(method, str):
         if method not in METHODS:
-            raise ValueError(unknown("method", method, METHODS))
+            raise ValueError(unknown_method(method))
         method = METHODS[method]
     elif not isinstance(method, Method):
         raise TypeError(f"method must be a name or a Method, got {method!r}")

@@ -19,13 +19,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mpfa.checks import COUNT_OR_ZERO, POSITIVE, SHARE, check
 from torchrl_mpfa.losses import BEHAVIOR_MEAN, BEHAVIOR_SIGMA, BEHAVIOR_WEIGHT, POLICY_WEIGHT
-from torchrl_mpfa.methods.klper import actions_of
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.selection import SampledBatch
 
@@ -34,6 +36,25 @@ LEAST_SIGMA = 0.2
 _CUTOFF_DECAY = 5e-7
 _RATE = 0.1
 _FIRST_WEIGHT = 1e-4
+
+
+def actions_of(
+    policy: TensorDictModule, batch: TensorDictBase, *, action_key: NestedKey = "action"
+) -> Tensor:
+    """Compute actions ``[B, A]`` of a policy without exploration, on the device of the batch."""
+    read = batch.select(*policy.in_keys)
+    parameter = next(policy.parameters(), None)
+    if parameter is not None:
+        read = read.to(parameter.device)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action: Tensor = policy(read)[action_key]
+    stored: Tensor = batch[action_key]
+    if stored.shape != action.shape:
+        raise ValueError(
+            f"{action_key!r} must have the shape of the policy's actions, {[*action.shape]}, got "
+            f"{[*stored.shape]}"
+        )
+    return action.to(stored.device)
 
 
 def importance_ratio(action: Tensor, now: Tensor, then: Tensor, sigma: Tensor) -> Tensor:

@@ -14,10 +14,7 @@ if TYPE_CHECKING:
 
 SignalFunction = Callable[..., Any]
 """From a learner and a batch to a signal, shape ``[B]``."""
-OF_LOSSES = (
-    *("reward", "td_error", "action_gradient", "value"),
-    *("relative_value", "relative_td_error", "information_gain"),
-)
+OF_LOSSES = ("reward", "td_error", "action_gradient", "value", "information_gain")
 """Signals that learners and losses write, or that are read at a write."""
 SIGNALS: dict[str, SignalFunction | type[SignalFunction]] = {}
 """The registered signals by name; :func:`register_signal` adds one."""

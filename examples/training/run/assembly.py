@@ -7,6 +7,7 @@ import shutil
 import sysconfig
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,6 @@ from torchrl_mpfa import (
     make_value_network,
 )
 from torchrl_mpfa.methods import Method, Prioritized, loss_options
-from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor
 from torchrl_mpfa.networks.deterministic import ValueNetwork
 from training.run.q_learning import TabularQLearner, ValueTable, make_value_table
@@ -77,7 +77,8 @@ def make_learner(
             "policy_noise": settings.policy_noise,
             "noise_clip": settings.noise_clip,
         }
-    return ActorCritic(
+    kind: type[ActorCritic] = resolve_name(method.learner)
+    return kind(
         actor.to(device),
         critic.to(device),
         **of_algorithm[algorithm],
@@ -90,7 +91,6 @@ def make_learner(
         critic_lr=settings.critic_lr,
         critic_weight_decay=settings.critic_weight_decay,
         tau=settings.tau,
-        optimizer=method.optimizer,  # type: ignore[arg-type]
         compile=compile,
     )
 
@@ -106,7 +106,6 @@ def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Le
         lr=settings.critic_lr,
         weight_decay=settings.critic_weight_decay,
         tau=settings.tau,
-        optimizer=method.optimizer,  # type: ignore[arg-type]
     )
 
 
@@ -153,16 +152,6 @@ def policy_layers(policy: TensorDictModule) -> list[Layer]:
         return [Table(module.table.numpy().copy(), **asdict(cells.binning)), choice]
     network = policy if isinstance(policy, StochasticActor) else policy.module
     return from_torch(network.layers())
-
-
-def make_curiosity(
-    method: Method, observation_size: int, action_size: int, *, device: str = "cpu"
-) -> Curiosity | None:
-    """The bonus on rewards, if the method has one."""
-    if not method.curiosity:
-        return None
-    made = Curiosity(observation_size, action_size, scale=method.curiosity)
-    return made.to(device)
 
 
 _MANY_UPDATES = 5_000

@@ -115,7 +115,7 @@ def state_of(run: TrainingRun) -> dict[str, Any]:
         "learner": run.learner.state_dict(),
         "buffer": run.buffer.state_dict(),
         "explorer": run.explorer.state_dict(),
-        "curiosity": None if run.curiosity is None else run.curiosity.checkpoint(),
+        "curiosity": None if run.bonus is None else run.bonus.checkpoint(),
         "signals": run.signals.state_dict(),
         "plugin": files.digest_of(run.settings.plugin),
         "best": None if run.best is None else dict(run.best.state_dict()),
@@ -134,8 +134,8 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
     run.learner.load_state_dict(state["learner"])
     run.buffer.load_state_dict(state["buffer"])
     run.explorer.load_state_dict(state["explorer"])
-    if run.curiosity is not None:
-        run.curiosity.restore(state["curiosity"])
+    if run.bonus is not None:
+        run.bonus.restore(state["curiosity"])
     run.signals.load_state_dict(state.get("signals", {}))
     if state["best"] is not None:
         run.best = copy.deepcopy(run.learner.policy)

@@ -28,7 +28,7 @@ from training.evaluating import Drives
 from training.files import no_room
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import tracking
-from training.run.assembly import is_compiled, make_curiosity, make_learner, method_of
+from training.run.assembly import is_compiled, make_learner, method_of
 from training.run.checkpoints import (
     Checkpoints,
     is_sound,
@@ -196,7 +196,8 @@ class TrainingRun:
             settings.learner, method, *sizes, device=device, compile=self._to_compile
         )
         self.signals = OwnSignals(learned_signals(method))
-        self.curiosity = make_curiosity(method, *sizes, device=device)
+        bonus = method.bonus(*sizes)
+        self.bonus = None if bonus is None else bonus.to(device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
         replay = make_replay(
             method,
@@ -329,14 +330,14 @@ class TrainingRun:
                 self.log.learns(index)
         if device != "cpu":
             sampled = replace(sampled, batch=sampled.batch.to(device))
-        if not sampled.gives_signals or (self.curiosity is None and not self.signals):
+        if not sampled.gives_signals or (self.bonus is None and not self.signals):
             return sampled
         return sampled.each(self._extend)
 
     def _extend(self, batch: TensorDictBase) -> None:
         """Add the bonus and the signals of the run to a batch."""
-        if self.curiosity is not None:
-            self._bonus = self.curiosity(batch)
+        if self.bonus is not None:
+            self._bonus = self.bonus(batch)
         self.signals.write(self.learner, batch)
 
     def _evaluate(self) -> None:

@@ -115,7 +115,9 @@ def _check_method(method: Method) -> None:
         replace(method)
     known = [*OF_LOSSES, *SIGNALS]
     for signal in method.priority_signals():
-        if signal.name not in known:
+        # What a signal is made of, by whatever name.
+        entry = signal.key[-1] if isinstance(signal.key, tuple) else signal.key
+        if entry not in known:
             raise ValueError(
                 f"method.signals must be of {', '.join(known)}, got {signal.name!r}: a plugin can "
                 "register others"

@@ -24,6 +24,7 @@ from yaml import YAMLError
 
 from mpfa_envs.robots.resolve import resolve_robot
 from torchrl_mpfa.methods import METHODS, Method
+from torchrl_mpfa.methods.catalogue import RECONSTRUCTED, unknown_method
 from training.plugins import with_plugin
 from training.settings.rules import named, settings_by_name
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings, register
@@ -84,6 +85,8 @@ def _parsed(texts: Sequence[str]) -> list[Override]:
 def _check_choices(group: str, words: Sequence[str]) -> None:
     """Raise for unknown choices of a group, and choices that exclude each other."""
     for word in words:
+        if group == "method" and word in RECONSTRUCTED and word not in METHODS:
+            raise ValueError(unknown_method(word))
         if word not in GROUPS[group]:
             raise ValueError(
                 f"unknown choice {word!r} of {group!r}{_nearest(word, GROUPS[group])}; "

@@ -404,6 +404,9 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     if "method" in values:
         # Each method has settings of its own: its name says which.
         structure.method = method_named(values.method.name)
+        # Of earlier versions all methods have it.
+        if values.method.get("optimizer") == "adam" and not hasattr(structure.method, "optimizer"):
+            values.method.pop("optimizer")
     merged = OmegaConf.merge(structure, values)
     merged.pop("hydra", None)
     if merged.actions is not None:

@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import RandomSampler
 
+from benchmarks.paper.methods.mw import MWSampler
 from tests.mpfa.transitions import make_buffer
 from torchrl_mpfa import (
     MPFASampler,
@@ -13,7 +14,6 @@ from torchrl_mpfa import (
     SignalTensorStorage,
 )
 from torchrl_mpfa.methods.la3p import LA3PSampler
-from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from training.run.updates import ReplayHistory
 

@@ -60,6 +60,7 @@ def of_robots(physics: str) -> TrainSettings:
     return settings
 
 
+pytestmark = pytest.mark.usefixtures("reconstructed")
 RESUMED = {
     **{f"{name}-ddpg": tiny(name) for name in ("mpfa_per", "averaged_ddpg", "cer", "ddpg_radam")},
     **{f"{name}-ddpg": tiny(name) for name in ("hvper", "klper", "mw", "rank_per")},
@@ -128,7 +129,7 @@ def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     settings.method.curiosity = 1e6
     # Nothing is learned in the first episodes, so that both runs drive the same way.
     settings.method.batch_size = settings.method.capacity = 1000
-    plain = replace(METHODS["per"], capacity=1000, batch_size=1000, optimizer="radam")
+    plain = replace(METHODS["per"], capacity=1000, batch_size=1000)
     without = replace(settings, method=plain)
     curious, bare = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
     assert [r.reward for r in curious.records] == [r.reward for r in bare.records]

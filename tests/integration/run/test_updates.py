@@ -31,6 +31,7 @@ def of_run(folder: Path) -> pd.DataFrame:
     return read_table(folder / "updates.csv")
 
 
+@pytest.mark.usefixtures("reconstructed")
 @pytest.mark.parametrize("method", mostly_slow(["mpfa_per", "uniform", "klper"], ["mpfa_per"]))
 def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
     tmp_path: Path, method: str

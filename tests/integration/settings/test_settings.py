@@ -213,7 +213,7 @@ def usual() -> TrainSettings:
         *(
             (f"learner={learner} method={method}", f"method={method} is not for learner={learner}")
             for learner in ("dqn", "q_learning")
-            for method in ("hvper", "la3p", "ref_er", "averaged_ddpg", "ddpg_radam")
+            for method in ("la3p", "ref_er", "uper")
         ),
         *(
             (f"learner=q_learning method={method}", "method.loss_function must be l2 with .*ning")

@@ -19,6 +19,7 @@ from torchrl.data import (
 )
 from torchrl.envs.transforms import MultiStepTransform, Transform
 
+from benchmarks.paper.methods.mw import MWSampler
 from torchrl_mpfa import (
     FixedFusion,
     MPFASampler,
@@ -30,7 +31,6 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.methods.la3p import LA3PSampler
-from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.samplers.uniform import CERSampler

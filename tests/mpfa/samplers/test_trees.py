@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
+from benchmarks.paper.methods.mw import MWSampler
 from tests.mpfa.second_device import DEVICE, SecondDevice, use_leaves
 from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
 from torchrl_mpfa import MPFASampler, SignalTensorStorage
 from torchrl_mpfa.methods.la3p import LA3PSampler
-from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.samplers.trees import MinLeaves, SumLeaves, last_of_each, leaves_of, set_leaves
 

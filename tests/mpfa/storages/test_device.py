@@ -11,7 +11,7 @@ from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.samplers import TreeSampler
 
-pytestmark = pytest.mark.usefixtures("second_device")
+pytestmark = pytest.mark.usefixtures("second_device", "reconstructed")
 CPU = torch.device("cpu")
 CAPACITY, BATCH = 24, 8
 # One of each selection, and of each part that reads the whole buffer.

@@ -6,9 +6,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from benchmarks.paper.methods.ddpg_radam import Curiosity, intrinsic_reward
+from tests.mpfa.learning import make_learner
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa.learners.optimized import make_optimizer
-from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
+from torchrl_mpfa.learners.adam import FlatAdam
 
 
 def make_batch(count=64, *, seed=0, shift=0.0):
@@ -113,5 +114,5 @@ def test_batch_with_nan_is_rejected_and_changes_nothing(key):
 
 
 def test_radam_is_that_of_pytorch():
-    groups = [{"params": [torch.nn.Parameter(torch.zeros(2))], "lr": 0.1}]
-    assert isinstance(make_optimizer("radam", groups), torch.optim.RAdam)
+    assert isinstance(make_learner(optimizer="radam").optimizer, torch.optim.RAdam)
+    assert isinstance(make_learner(optimizer="adam").optimizer, FlatAdam)

@@ -5,9 +5,9 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import MultivariateNormal, kl_divergence
 
+from benchmarks.paper.methods.klper import KLPERSelection, gaussian_divergence
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor
-from torchrl_mpfa.methods.klper import KLPERSelection, gaussian_divergence
 
 
 @pytest.mark.parametrize("shape", [(8,), (8, 1), (8, 3)])

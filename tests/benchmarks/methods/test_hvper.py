@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from tests.methods.replays import make_buffer
-from tests.mpfa.transitions import seeded
-from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.methods.hvper import (
+from benchmarks.paper.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
     HVPERPenalty,
     value_schedule,
 )
+from tests.methods.replays import make_buffer
+from tests.mpfa.transitions import seeded
+from torchrl_mpfa import SignalSampler
 
 KAPPA, EPS = 0.25, 0.01
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from benchmarks.paper.methods.mw import MWSampler
 from tests.methods.replays import make_buffer
 from tests.mpfa.transitions import make_transitions, set_signals
 from torchrl_mpfa import Adjustment, FixedFusion, ScaledFusion
-from torchrl_mpfa.methods.mw import MWSampler
 
 SIGNALS = ["reward", "td_error"]
 

@@ -12,7 +12,8 @@ no further from it, are our reading.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -20,10 +21,12 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
-from torchrl_mpfa.selection import SampledBatch, one_batch
+from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, check, check_counts
+from torchrl_mpfa.methods import Method
+from torchrl_mpfa.methods.base import within
+from torchrl_mpfa.methods.ref_er import actions_of
+from torchrl_mpfa.selection import SampledBatch, Selection, one_batch
 
 _LEAST_VARIANCE = 1e-3
 
@@ -67,25 +70,6 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
     covariance = centered.mT @ centered / deviation.shape[-2]
     wider = (torch.linalg.eigvalsh(covariance) / variance).clamp_min(1.0)
     return 0.5 * ((wider - 1.0 - wider.log()).sum(-1) + mean.square().sum(-1) / variance)
-
-
-def actions_of(
-    policy: TensorDictModule, batch: TensorDictBase, *, action_key: NestedKey = "action"
-) -> Tensor:
-    """Compute actions ``[B, A]`` of a policy without exploration, on the device of the batch."""
-    read = batch.select(*policy.in_keys)
-    parameter = next(policy.parameters(), None)
-    if parameter is not None:
-        read = read.to(parameter.device)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        action: Tensor = policy(read)[action_key]
-    stored: Tensor = batch[action_key]
-    if stored.shape != action.shape:
-        raise ValueError(
-            f"{action_key!r} must have the shape of the policy's actions, {[*action.shape]}, got "
-            f"{[*stored.shape]}"
-        )
-    return action.to(stored.device)
 
 
 class KLPERSelection:
@@ -157,3 +141,24 @@ class KLPERSelection:
             variance=max(sigma**2, _LEAST_VARIANCE),
         )
         return tensordict.reshape(self.batches, -1)[int(divergence.argmin())]
+
+
+@dataclass
+class KLPER(Method):
+    """The most on-policy one of several uniform batches."""
+
+    name: str = "klper"
+    candidates: int = within(COUNT, 3)
+    """Batches of which the most on-policy one is trained on."""
+    needs: ClassVar[tuple[str, ...]] = ("policy", "sigma")
+    why: ClassVar[str] = "it chooses on-policy batches"
+    needs_actor: ClassVar[bool] = True
+
+    @property
+    def rows(self) -> int:
+        """Transitions of all candidates."""
+        return self.batch_size * self.candidates
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the selection of the nearest candidate."""
+        return KLPERSelection(policy, batches=self.candidates, sigma=sigma).select

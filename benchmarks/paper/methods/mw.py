@@ -9,12 +9,16 @@ paper; that both are divided by their means and count the same, and the number, 
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import COUNT, check_counts
+from torchrl_mpfa.fusion import Fusion, ScaledFusion
+from torchrl_mpfa.methods import Prioritized
+from torchrl_mpfa.methods.base import within
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.trees import set_leaves
 
@@ -78,3 +82,23 @@ class MWSampler(SignalSampler):
         if left >= batch_size:
             return super()._sample_slots(size, batch_size)
         return self._uniform(size, batch_size), torch.ones(batch_size, device=self.device)
+
+
+@dataclass
+class MW(Prioritized):
+    """Reward and TD error in equal shares, with a cap on replays (MW-MADDPG)."""
+
+    kind: ClassVar[str] = "benchmarks.paper.methods.mw.MWSampler"
+
+    name: str = "mw"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error"])
+    replay_cap: int = within(COUNT, 1024)
+    """Replays after which a transition is excluded."""
+
+    def fusion(self) -> Fusion:
+        """Make the fusion in equal shares."""
+        return ScaledFusion(super().fusion())
+
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the cap."""
+        return {"replay_cap": self.replay_cap}

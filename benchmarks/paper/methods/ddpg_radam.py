@@ -8,16 +8,23 @@ and after it; the bonus is the error of predicting the latter from the former an
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_mpfa.checks import POSITIVE, SHARE, check, check_counts
+from torchrl_mpfa import ActorCritic
+from torchrl_mpfa.checks import POSITIVE, SHARE, Rule, check, check_counts
 from torchrl_mpfa.learners.optimized import check_losses
+from torchrl_mpfa.methods import Prioritized
+from torchrl_mpfa.methods.base import one_of, within
+
+OPTIMIZER: Rule = (lambda name: name in ("radam", "adam"), "'radam' or 'adam'")
 
 
 def intrinsic_reward(foreseen: Tensor, features: Tensor, *, scale: float) -> Tensor:
@@ -153,3 +160,54 @@ class Curiosity(nn.Module):
         """Restore a state from :meth:`checkpoint`."""
         self.load_state_dict(state["models"])
         self.optimizer.load_state_dict(state["optimizer"])
+
+
+class RAdamLearner(ActorCritic):
+    """A learner whose optimizer warms up by itself (Liu et al. 2020, arXiv:1908.03265).
+
+    Args:
+        *networks: As :class:`~torchrl_mpfa.ActorCritic`.
+        optimizer: ``"radam"``, or ``"adam"`` as elsewhere.
+        **options: As :class:`~torchrl_mpfa.ActorCritic`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic
+        >>> type(RAdamLearner(make_actor(24, 2), make_critic(24, 2)).optimizer).__name__
+        'RAdam'
+    """
+
+    def __init__(
+        self, *networks: TensorDictModule, optimizer: str = "radam", **options: Any
+    ) -> None:
+        self._optimizer_name = check(OPTIMIZER, optimizer=optimizer)
+        super().__init__(*networks, **options)
+
+    def make_optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """Make the optimizer of the name, which steps all tensors in one call."""
+        if self._optimizer_name == "adam":
+            return super().make_optimizer(groups)
+        return torch.optim.RAdam(groups, foreach=True)
+
+
+@dataclass
+class Curious(Prioritized):
+    """PER with RAdam, and a bonus for outcomes that the robot could not predict (ICM)."""
+
+    name: str = "ddpg_radam"
+    optimizer: str = one_of("radam", "adam")
+    """``radam`` or ``adam``."""
+    curiosity: float = within(POSITIVE, 0.01)
+    """eta: factor of the bonus."""
+    learner: ClassVar[str] = "benchmarks.paper.methods.ddpg_radam.RAdamLearner"
+    needs_actor: ClassVar[bool] = True
+
+    def learner_options(self) -> dict[str, Any]:
+        """Return the name of the optimizer."""
+        return {"optimizer": self.optimizer}
+
+    def bonus(self, observation_size: int, action_size: int) -> Curiosity:
+        """Make the models whose errors are the bonus."""
+        return Curiosity(observation_size, action_size, scale=self.curiosity)

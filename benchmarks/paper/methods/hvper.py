@@ -14,7 +14,7 @@ to [0, 1] within a batch, the schedule of the weights and the penalty on replays
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
@@ -23,6 +23,8 @@ from torch import Tensor
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check, keep
 from torchrl_mpfa.fusion import FixedFusion, Fusion
+from torchrl_mpfa.methods import Prioritized
+from torchrl_mpfa.methods.base import within
 from torchrl_mpfa.signals import Signal
 
 if TYPE_CHECKING:
@@ -171,3 +173,27 @@ class HVPERPenalty(Adjustment):
         count = batch.replay_count.to(priority.dtype)
         share = count / count.max().clamp_min(1.0)
         return (priority - self.penalty * share).clamp_min(self.floor)
+
+
+@dataclass
+class HVPER(Prioritized):
+    """Places of Q value and TD error in the batch, with a schedule and a penalty on replays."""
+
+    name: str = "hvper"
+    signals: list[str] = field(default_factory=lambda: ["relative_value", "relative_td_error"])
+    eps: float = 0.01
+    replay_penalty: float = within(NOT_NEGATIVE, 0.25)
+    """Penalty on replays."""
+
+    def priority_signals(self) -> list[Signal]:
+        """Return the signals of the priority; an unknown name is a signal of the loss."""
+        relative = {signal.name: signal for signal in (RELATIVE_VALUE, RELATIVE_ERROR)}
+        return [relative.get(signal.name, signal) for signal in super().priority_signals()]
+
+    def fusion(self) -> Fusion:
+        """Make the fusion with a schedule."""
+        return value_schedule()
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the penalty."""
+        return [HVPERPenalty(penalty=self.replay_penalty, floor=self.eps)]

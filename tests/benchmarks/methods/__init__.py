@@ -1,0 +1,1 @@
+"""Tests of the reconstructed methods of the paper's table."""
