@@ -1,9 +1,10 @@
-"""A device beside the CPU for the tests of the replay parts."""
+"""A device beside the CPU, and compiled loops that are looked for anew, for the replay parts."""
 
 import pytest
 import torch
 
 from tests.mpfa.second_device import emulated
+from torchrl_mpfa import native
 
 
 @pytest.fixture
@@ -14,3 +15,12 @@ def second_device(monkeypatch):
         return
     with emulated(monkeypatch) as machine:
         yield machine
+
+
+@pytest.fixture
+def own_library(monkeypatch):
+    """A test looks for the compiled loops by its own environment, and so does the next one."""
+    monkeypatch.delenv("TORCHRL_MPFA_NATIVE", raising=False)
+    native.find_loops.cache_clear()
+    yield
+    native.find_loops.cache_clear()

@@ -21,7 +21,6 @@ from torchrl_mpfa import (
     SignalMemmapStorage,
     SignalReplayBuffer,
     SignalTensorStorage,
-    native,
 )
 from torchrl_mpfa.samplers.trees import MinTree, SumTree, set_leaves, slots_at
 
@@ -30,13 +29,7 @@ ONE = torch.ones(1, dtype=torch.double)
 """Of the sum: rounding can carry a mass past the last slot."""
 
 
-@pytest.fixture(autouse=True)
-def own_library(monkeypatch):
-    """Each test chooses its path, and the next one looks for the loops again."""
-    monkeypatch.delenv("TORCHRL_MPFA_NATIVE", raising=False)
-    native.find_loops.cache_clear()
-    yield
-    native.find_loops.cache_clear()
+pytestmark = pytest.mark.usefixtures("own_library")
 
 
 def per_signal(name):

@@ -15,14 +15,7 @@ from tests.mpfa.transitions import make_buffer, make_transitions, write_signals
 from torchrl_mpfa import native
 from torchrl_mpfa.native.build import compile_library, library_name
 
-
-@pytest.fixture(autouse=True)
-def own_library(monkeypatch):
-    """Each test looks for the loops, and the next one looks again."""
-    monkeypatch.delenv("TORCHRL_MPFA_NATIVE", raising=False)
-    native.find_loops.cache_clear()
-    yield
-    native.find_loops.cache_clear()
+pytestmark = pytest.mark.usefixtures("own_library")
 
 
 def finds_loops(home, monkeypatch, reason):
