@@ -29,6 +29,7 @@ from torchrl_mpfa.samplers.trees import (
     last_of_each,
     leaves_of,
     make_trees,
+    put_leaves,
     random_shares,
     set_leaves,
     slots_at,
@@ -335,21 +336,17 @@ class TreeSampler(SavedTrees):
     def _fresh_priority(self) -> float | Tensor:
         """Return the priority of a fresh transition, eps included; a GPU is not waited for."""
         first = 1.0 + self._eps
-        if (
-            isinstance(self._max_tree, MinLeaves)
-            and self._max_priority_within_buffer
-            and self._alpha
-        ):
+        within = self._max_priority_within_buffer and self._alpha
+        if isinstance(self._max_tree, MinLeaves) and within:
             highest = -self._max_tree.query(0, self._max_capacity)
             return highest.where(highest >= 0, first)
         priority = self._highest_priority()
         return first if priority is None else priority
 
-    def add(self, index: Tensor | int) -> None:
+    def extend(self, index: Any) -> None:
         """Nothing to do: the tree of highest priorities forgets an overwritten slot by itself."""
 
-    def extend(self, index: Tensor | tuple[Any, ...]) -> None:
-        """Nothing to do, as for :meth:`add`."""
+    add = extend
 
     @torch.no_grad()
     def update_priority(
@@ -430,14 +427,8 @@ class TreeSampler(SavedTrees):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""
-        leaf = self._leaf(priority)
-        if self._apart is None:
-            self._sum_tree.put(slots, leaf, priority, learned=learned)
-        else:
-            self._priorities.index_copy_(0, slots, priority)
-            given = -priority if learned else torch.full_like(priority, math.inf)
-            set_leaves(slots, given, self._max_tree)
-            set_leaves(slots, leaf, self._sum_tree, self._min_tree)
+        leaf, trees = self._leaf(priority), (self._sum_tree, self._min_tree, self._max_tree)
+        put_leaves(trees, self._apart, slots, leaf, priority, learned=learned)
         self._follow(slots, leaf)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:

@@ -271,6 +271,24 @@ def leaves_of(tree: Any, slots: Tensor) -> Tensor:
     return torch.from_numpy(tree[slots.contiguous().numpy()])
 
 
+def put_leaves(
+    trees: tuple[Any, Any, Any],
+    apart: Tensor | None,
+    slots: Tensor,
+    leaf: Tensor,
+    priority: Tensor,
+    *,
+    learned: bool,
+) -> None:
+    """Write leaves to trees of :func:`make_trees`, and their priorities, each ``[B]``."""
+    if apart is None:
+        trees[0].put(slots, leaf, priority, learned=learned)
+        return
+    apart.index_copy_(0, slots, priority)
+    set_leaves(slots, leaf, *trees[:2])
+    set_leaves(slots, -priority if learned else torch.full_like(priority, torch.inf), trees[2])
+
+
 def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
     """Write leaves of slots, shape ``[B]``; the last leaf of a repeated slot counts."""
     takes_tensors = isinstance(trees[0], Leaves | CompiledTree)
