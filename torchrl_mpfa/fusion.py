@@ -177,10 +177,9 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
         [2.0]
     """
     # Signal by signal: a product of matrices adds in an order that depends on their size.
-    first, *others = zip(signals.unbind(1), weights.unbind(), strict=True)
-    priority = first[0] * first[1]
-    for signal, weight in others:
-        priority = priority + signal * weight
+    priority, *others = (signals * weights).unbind(1)
+    for share in others:
+        priority = priority + share
     return priority + eps
 
 

@@ -186,7 +186,7 @@ def _check_rejections(buffer: SignalReplayBuffer) -> None:
 def _check_frequencies(buffer: SignalReplayBuffer) -> None:
     # Not more at once than a sampler with a cap can sample by priority.
     size = len(buffer)
-    leaf = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(size)]).reshape(-1).double()
+    leaf = buffer.sampler.trees.leaves(torch.arange(size))
     expected = leaf / leaf.sum()
     rounds = range(math.ceil(_SAMPLES / size))
     slots = torch.cat([buffer.sampler._sampled(buffer.storage, size)[0] for _ in rounds])

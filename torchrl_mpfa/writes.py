@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from multiprocessing.context import get_spawning_popen
 from typing import Any, NoReturn, TypeVar
 
@@ -15,11 +16,11 @@ from torchrl.data.replay_buffers import ConsumingSampler, PrioritizedSampler
 
 from torchrl_mpfa.checks import check_not_negative
 from torchrl_mpfa.native import opaque
-from torchrl_mpfa.samplers.compiled import write_compiled
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.sharing import SharedWrites, WriterSampler, check_shared
-from torchrl_mpfa.storages.schema import Schema, as_path, check_finite_entries
+from torchrl_mpfa.storages.plan import NewRows, RowPlan
+from torchrl_mpfa.storages.schema import as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
 
@@ -33,7 +34,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
 
     _memory: TransformMemory
     _allow_nonfinite: Sequence[NestedKey] = ()
-    _schema: Schema | None = None
+    _plan: RowPlan | None = None
     _clock: list[int]
     """Count of writes, which the states of the buffer share and see change."""
 
@@ -56,13 +57,13 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def __getstate__(self) -> Any:
         if get_spawning_popen() is None:
             # The copy describes its own data.
-            return {**super().__getstate__(), "_schema": None}
+            return {**super().__getstate__(), "_plan": None}
         # The property, not the attribute: with delayed_init the parts are made at their first use.
         keeps = isinstance(self.sampler, SavedSampler)
         if keeps:
             check_shared(self)
         # A copy of the generator's state would be gone before the process reads it.
-        state = {**super().__getstate__(), "_schema": None, "_rng": None}
+        state = {**super().__getstate__(), "_plan": None, "_rng": None}
         by_priority = isinstance(self._sampler, PrioritizedSampler)
         return {**state, "_sampler": WriterSampler(by_priority=by_priority)} if keeps else state
 
@@ -102,48 +103,17 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 f"got {[*tensordicts.shape]}: write a single step by add(...)"
             )
         tensordicts = self._without_padding(tensordicts)
-        if (index := self._extend_compiled(tensordicts)) is not None:
-            return index
         # Outside of inference mode: a caller without it must be able to use what is stored.
         with (
             torch.inference_mode(False),
             torch.no_grad(),
-            self._memory.transformed(tensordicts) as data,
+            self._transformed(tensordicts) as data,
         ):
             return self._extend_checked(data, update_priority is not False)
 
-    def _extend_compiled(self, data: TensorDictBase) -> Tensor | None:
-        """Write transitions by compiled loops; None where PyTorch has to, or finds fault."""
-        storage, sampler, writer = self._storage, self._sampler, self._writer
-        if (
-            type(storage) not in (SignalTensorStorage, SignalMemmapStorage)
-            or storage.ndim != 1
-            or not storage.initialized
-            or type(data) is not TensorDict
-            or data.ndim != 1
-            or self.dim_extend
-            or not isinstance(sampler, SignalSampler)
-            or type(writer) is not TensorDictRoundRobinWriter
-            or writer.tracks_generations
-            or len(self._transform)
-            or any(other is not self for other in storage._attached_entities_iter())
-        ):
-            return None
-        with self._replay_lock, self._write_lock:
-            sampler.attach(storage)
-            start, count = writer._cursor, len(data)
-            allowed = self._allow_nonfinite
-            if not write_compiled(sampler, storage._storage, data, start, allowed):
-                return None
-            end = start + count
-            index = torch.arange(start, end, device="cpu")
-            index = index if end <= storage.max_size else index % storage.max_size
-            writer._cursor = end % storage.max_size
-            writer._write_count += count
-            storage.note_written(index)
-            sampler.table.size = len(storage)
-            self._clock[0] += 1
-        return index
+    def _transformed(self, data: TensorDictBase) -> AbstractContextManager[TensorDictBase | None]:
+        """Return the context in which transitions are as the transforms make them."""
+        return self._memory.transformed(data) if len(self._transform) else nullcontext(data)
 
     def _without_padding(self, data: TensorDictBase) -> TensorDictBase:
         """Leave out rows that a mask of padded trajectories marks, as ``split_trajs`` makes it."""
@@ -166,9 +136,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             shape = (0,) if self._storage.ndim == 1 else (0, self._storage.ndim)
             return torch.zeros(shape, dtype=torch.long, device="cpu")
         priority = data.get(self.priority_key, None)
-        # A copy in both cases, as the writer adds the slots, which the caller's data shall not get.
-        is_apart = priority is not None and isinstance(self._sampler, SignalSampler)
-        data = data.exclude(self.priority_key) if is_apart else data.copy()
+        if priority is not None and isinstance(self._sampler, SignalSampler):
+            data = data.exclude(self.priority_key)
         if type(data) is not TensorDict:
             data = data.contiguous()
         if priority is not None:
@@ -209,7 +178,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _write(self, data: TensorDictBase) -> Tensor:
         if self.dim_extend > 0:
             data = self._transpose(data)
-        rows = self._check(data)
+        planned, rows = self._check(data)
         writer = self._writer
         in_a_ring = isinstance(writer, RoundRobinWriter)
         place = (writer._cursor, writer._write_count) if in_a_ring else None
@@ -217,9 +186,12 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         if in_a_ring and rows is not None and self._storage.ndim == 1:
             self._sampler.take_rows(rows)
         try:
-            with torch.no_grad():
-                # The writer calls mark_update of this buffer, which calls that of the sampler.
-                index: Tensor = writer.extend(data)
+            if planned is not None:
+                index = self._write_in_turn(planned)
+            else:
+                # The writer calls mark_update of this buffer, which calls that of the sampler. It
+                # adds the slots, which the caller's data shall not get.
+                index = writer.extend(data.copy())
         except BaseException:
             if rows is not None:
                 self._sampler.take_rows(None)
@@ -231,8 +203,25 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         self._sampler.extend(index)
         return index
 
-    def _check(self, data: TensorDictBase) -> Tensor | None:
-        """Check transitions in the order of their slots; return their rows of the table, if any.
+    def _write_in_turn(self, rows: NewRows) -> Tensor:
+        """Write rows that fit the storage in the next slots, as TorchRL's writer does."""
+        storage, writer, count = self._storage, self._writer, len(rows)
+        start = writer._cursor
+        index = torch.arange(start, start + count, device="cpu")
+        if start + count > storage.max_size:
+            index %= storage.max_size
+        rows.write(index, storage.max_size)
+        writer._cursor = (start + count) % storage.max_size
+        writer._write_count += count
+        storage.note_written(index)
+        self._sampler.mark_update(index, storage=storage)
+        return index
+
+    def _check(self, data: TensorDictBase) -> tuple[NewRows | None, Tensor | None]:
+        """Check transitions in the order of their slots.
+
+        Returns:
+            The rows if they are written by the plan, and those of the table if there is one.
 
         Raises:
             KeyError: If an entry is missing or unknown, or one that the sampler reads is missing.
@@ -241,24 +230,34 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         """
         lead = min(self._storage.ndim, data.ndim)
         self._check_width(data)
-        schema = self._stored_schema()
-        if schema is not None:
-            schema.check(data, lead, whole=True)
-        else:
+        plan, planned = self._row_plan(), None
+        if plan is None:
             check_finite_entries(data, lead, self._allow_nonfinite)
+        elif not (self._writes_in_turn() and (planned := plan.match(data, with_index=False))):
+            plan.check(data, lead)
         if isinstance(self._sampler, SignalSampler):
-            return self._sampler.check_new(data, data.shape[:lead].numel())
-        return None
+            return planned, self._sampler.check_new(data, data.shape[:lead].numel())
+        return None, None
 
-    def _stored_schema(self) -> Schema | None:
-        """Return the schema of the stored tensordict; None before the first write."""
+    def _row_plan(self) -> RowPlan | None:
+        """Return the plan of the stored rows; None before the first write."""
         stored = getattr(self._storage, "_storage", None)
         # What an empty storage was restored from is a tensordict without entries.
         if not getattr(self._storage, "initialized", False) or not _is_plain(stored):
             return None
-        if self._schema is None or not self._schema.describes(stored):
-            self._schema = Schema(stored, self._storage.ndim, self._allow_nonfinite)
-        return self._schema
+        if self._plan is None or not self._plan.describes(stored):
+            self._plan = RowPlan(stored, self._storage.ndim, self._allow_nonfinite)
+        return self._plan
+
+    def _writes_in_turn(self) -> bool:
+        """Return True if a write is that of rows in the next slots, which nobody else is told."""
+        return (
+            type(self._storage) in (SignalTensorStorage, SignalMemmapStorage)
+            and type(self._writer) is TensorDictRoundRobinWriter
+            and not self._writer.tracks_generations
+            and isinstance(self._sampler, SignalSampler)
+            and all(other is self for other in self._storage._attached_entities_iter())
+        )
 
     def _check_width(self, data: TensorDictBase) -> None:
         """Reject rows of another width than those of a storage of several dimensions."""

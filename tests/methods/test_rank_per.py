@@ -39,10 +39,10 @@ def test_transitions_are_sampled_by_their_rank():
 def test_equal_priorities_have_one_share_that_of_their_mean_rank():
     sampler = make_sampler(1000)
     sampler.mark_update(torch.arange(1000))
-    assert len(torch.as_tensor(sampler._sum_tree[torch.arange(1000)]).unique()) == 1
+    assert len(sampler.trees.leaves(torch.arange(1000)).unique()) == 1
     buffer = make_buffer(make_sampler(6, rank_refresh=0), 6, 4)
     set_signals(buffer, td_error=torch.tensor([2.0, 5.0, 1.0, 2.0, 9.0, 2.0]))
-    leaves = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(6)])
+    leaves = buffer.sampler.trees.leaves(torch.arange(6))
     ranks = torch.tensor([4.0, 2.0, 6.0, 4.0, 1.0, 4.0], dtype=torch.double)
     torch.testing.assert_close(leaves, ranks.pow(-ALPHA))
 
@@ -56,7 +56,7 @@ def test_between_two_sortings_a_priority_gets_the_rank_that_it_would_have_had():
     sampler.update_signals(
         torch.tensor([9]), {"td_error": torch.tensor([8.5])}, storage=buffer._storage
     )
-    leaves = torch.as_tensor(sampler._sum_tree[torch.arange(10)])
+    leaves = sampler.trees.leaves(torch.arange(10))
     expected = torch.arange(1.0, 11.0).double().pow(-ALPHA)
     expected[9] = 3.0**-ALPHA
     torch.testing.assert_close(leaves, expected)
@@ -66,14 +66,14 @@ def test_all_are_sorted_when_enough_priorities_are_new():
     sampler = make_sampler(10, rank_refresh=0.5)
     buffer = make_buffer(sampler, 10, 4)
     set_signals(buffer, td_error=torch.arange(10.0, 0.0, -1.0))
-    ranks = [torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values]
+    ranks = [sampler.trees.leaves(torch.arange(10)).sort().values]
     for slot in range(6):
         sampler.update_signals(
             torch.tensor([slot]),
             {"td_error": torch.tensor([0.1 - 0.01 * slot])},
             storage=buffer._storage,
         )
-        ranks.append(torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values)
+        ranks.append(sampler.trees.leaves(torch.arange(10)).sort().values)
     whole = torch.arange(10.0, 0.0, -1.0).double().pow(-ALPHA)
     torch.testing.assert_close(ranks[0], whole)
     assert not torch.allclose(ranks[4], whole)

@@ -126,7 +126,7 @@ def test_leaves_are_those_of_the_authors_rules_through_writes_and_updates(seed, 
         buffer.update_tensordict_priority(batch)
         rules.learn(slots, errors)
         places = torch.tensor([row["slot"] for row in rules.rows])
-        leaves = buffer.sampler._sum_tree[places].tolist()
+        leaves = buffer.sampler.trees.leaves(places).tolist()
         assert leaves == pytest.approx([row["leaf"] for row in rules.rows], rel=1e-5)
 
 
@@ -157,7 +157,7 @@ def test_another_alpha_keeps_the_reliabilities():
     again = make_reaper([0, 0, 1, 1, 1], done, alpha=0.5)
     set_signals(again, td_error=errors)
     slots = torch.arange(5)
-    assert buffer.sampler._sum_tree[slots].equal(again.sampler._sum_tree[slots])
+    assert buffer.sampler.trees.leaves(slots).equal(again.sampler.trees.leaves(slots))
 
 
 def test_missing_entry_or_part_is_named():

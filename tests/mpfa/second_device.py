@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_map_only
 
 from torchrl_mpfa import checks
 from torchrl_mpfa.samplers import TreeSampler
-from torchrl_mpfa.samplers.trees import MinLeaves, SumLeaves
+from torchrl_mpfa.samplers.trees import MinLeaves, PlainTrees, SumLeaves
 
 DEVICE = torch.device("cuda:0")
 WAITS = (
@@ -121,8 +121,15 @@ def use_leaves(monkeypatch):
 
     def init(self):
         made(self)
-        self._sum_tree = SumLeaves(self._max_capacity)
-        self._min_tree, self._max_tree = (MinLeaves(self._max_capacity) for _ in range(2))
-        self._apart = torch.full((self._max_capacity,), torch.nan, dtype=torch.double)
+        self.trees = make_leaves(self._max_capacity)
 
     monkeypatch.setattr(TreeSampler, "_init", init)
+
+
+def make_leaves(capacity):
+    """Trees on the CPU as another device has them."""
+    trees = PlainTrees(capacity, torch.device("cpu"))
+    trees.waits = True
+    trees._sums = SumLeaves(capacity, torch.device("cpu"))
+    trees._lows, trees._highs = (MinLeaves(capacity, torch.device("cpu")) for _ in range(2))
+    return trees

@@ -30,7 +30,7 @@ from torchrl_mpfa.samplers import TreeSampler
 
 
 def leaves(buffer):
-    return torch.as_tensor(buffer.sampler._sum_tree[torch.arange(len(buffer))])
+    return buffer.sampler.trees.leaves(torch.arange(len(buffer)))
 
 
 def test_rows_that_were_overwritten_since_they_were_sampled_are_dropped_and_counted():
@@ -193,10 +193,12 @@ def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage
     assert len(buffer) == 11
     assert batch["index"].max() < 11
     assert "stale_updates" in buffer.stats()
-    if hasattr(buffer.sampler, "_sum_tree"):
+    if hasattr(buffer.sampler, "trees"):
         last = {int(slot): float(td) for td, slot in enumerate(batch["index"])}
         for slot, td_error in last.items():
-            assert float(buffer.sampler._sum_tree[slot]) == pytest.approx((td_error + 0.05) ** 0.6)
+            assert float(buffer.sampler.trees.leaves(torch.tensor([slot]))) == pytest.approx(
+                (td_error + 0.05) ** 0.6
+            )
 
 
 @pytest.mark.parametrize("forget", ["empty", "load", "loads", "save", "dumps"])
@@ -247,7 +249,7 @@ def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(mak
         buffer.extend(data[3 * row : 3 * row + 3])
     batch = buffer.sample()
     assert batch[key].equal(data[key][batch["index"]])
-    if hasattr(buffer.sampler, "_sum_tree"):
+    if hasattr(buffer.sampler, "trees"):
         assert leaves(buffer).tolist() == [1, 2, 3, 4, 5, 6]
 
 

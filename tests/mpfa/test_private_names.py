@@ -107,12 +107,10 @@ SAMPLER = {
     "_max_capacity": lambda b: b._sampler._max_capacity == 8,
     "_max_priority_within_buffer": lambda b: b._sampler._max_priority_within_buffer is False,
     "_maybe_init_from_storage": lambda b: takes(b._sampler._maybe_init_from_storage, "storage"),
-    "_min_tree": lambda b: b._sampler._min_tree.query(0, 5) > 0,
     "_retransform_priority_trees": lambda b: takes(
         b._sampler._retransform_priority_trees, "old_alpha", "new_alpha"
     ),
     "_rng": lambda b: b._sampler._rng is b._rng,
-    "_sum_tree": lambda b: b._sampler._sum_tree.query(0, 5) > 0,
 }
 WRITER = {
     "_cursor": lambda b: b._writer._cursor == 5,
@@ -128,6 +126,7 @@ REST = {
         == (2,)
     ),
     "_set_tuple": lambda b: set_by_path(),
+    "_tensordict": lambda b: rows(2)._tensordict["a"].shape == (2, 1),
 }
 KNOWN: dict[str, Any] = {**BUFFER, **STORAGE, **SAMPLER, **WRITER, **REST}
 OURS = {"_depth", "_step"}

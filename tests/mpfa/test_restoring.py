@@ -168,7 +168,7 @@ SPOILS = [
     ((*TABLE, "rows"), torch.ones(7, 6).double(), r"'rows' of the saved .* be \[8, 6\] doubles"),
     ((*TABLE, "size"), -1, "size must be an integer from 0"),
     ((*TABLE, "writes"), 7, "times of the saved signals must be below 7, got 7"),
-    ((*SAMPLER, "_format"), 3, "'_format' of the saved sampler must be 4, got 3"),
+    ((*SAMPLER, "_format"), 3, "'_format' of the saved sampler must be 5, got 3"),
 ]
 OF_THE_STORAGE = [
     ((*STORAGE, "_len"), MISSING, "'_len' is missing in the saved storage"),

@@ -59,7 +59,7 @@ def test_batches_carry_places_and_updates_find_them():
     slots = place[:, 0] * ENVS + place[:, 1]
     known = table.rows[:, table.column["td_error"]].isfinite().nonzero().squeeze(1)
     assert known.tolist() == slots.unique().tolist()
-    leaves = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(ENVS * STEPS)])
+    leaves = buffer.sampler.trees.leaves(torch.arange(ENVS * STEPS))
     fresh = leaves[[slot for slot in range(ENVS * STEPS) if slot not in slots.tolist()]]
     assert fresh.unique().numel() == 1
     assert not torch.isin(leaves[slots], fresh).all()
@@ -71,7 +71,7 @@ def test_priorities_by_hand_take_places_too():
     for index in (torch.tensor([[1, 2], [3, 0]]), (torch.tensor([1, 3]), torch.tensor([2, 0]))):
         buffer.update_priority(index, torch.tensor([7.0, 9.0]))
         slots = torch.tensor([1 * ENVS + 2, 3 * ENVS])
-        found = torch.as_tensor(buffer.sampler._sum_tree[slots])
+        found = buffer.sampler.trees.leaves(slots)
         assert found.tolist() == pytest.approx([7.05**0.6, 9.05**0.6])
     # As a number it would be a slot: 0 * 3 + 3.
     with rejected(buffer, IndexError, r"within the storage's shape \[8, 3\], got \[0, 3\]"):

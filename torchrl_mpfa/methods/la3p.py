@@ -18,7 +18,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import Rule, check
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.samplers.trees import empty_tree_like, leaves_of, set_leaves
+from torchrl_mpfa.samplers.trees import make_trees
 from torchrl_mpfa.selection import SampledBatch
 
 Part = Literal["uniform", "prioritized", "inverse"]
@@ -56,10 +56,10 @@ class LA3PSampler(SignalSampler):
 
     def _init(self) -> None:
         super()._init()
-        self._inverse_tree = empty_tree_like(self._sum_tree, self._max_capacity, self.device)
+        self._inverse = make_trees(self._max_capacity, self.device)
 
     def _follow(self, slots: Tensor, leaf: Tensor) -> None:
-        set_leaves(slots, 1.0 / leaf, self._inverse_tree)
+        self._inverse.put(slots, 1.0 / leaf)
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
         highest = super()._checked(priority, name)
@@ -100,8 +100,8 @@ class LA3PSampler(SignalSampler):
         if self._part == "uniform":
             index = self._uniform(size, count)
         else:
-            tree = self._inverse_tree if self._part == "inverse" else self._sum_tree
-            index = self._proportional(tree, size, count)
+            trees = self._inverse if self._part == "inverse" else self.trees
+            index, _ = self._proportional(trees, size, count)
         return index, torch.ones(count, device=self.device)
 
     def batch_weights(self, size: int) -> Tensor:
@@ -110,12 +110,11 @@ class LA3PSampler(SignalSampler):
 
     def _restore(self, state: dict[str, Any]) -> None:
         super()._restore(state)
-        slots = self._priorities.isfinite().nonzero().squeeze(1)
-        leaves = leaves_of(self._sum_tree, slots) if len(slots) else self._priorities[slots]
-        if not bool((leaves > 0).all()):
-            raise ValueError("'_sum_tree' of the saved sampler must be positive, got 0")
-        if len(slots):
-            set_leaves(slots, 1.0 / leaves, self._inverse_tree)
+        if len(slots := self._known()):
+            leaves = self.trees.leaves(slots)
+            if not bool((leaves > 0).all()):
+                raise ValueError("'_leaves' of the saved sampler must be positive, got 0")
+            self._inverse.put(slots, 1.0 / leaves)
 
 
 def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:

@@ -86,8 +86,8 @@ class RankPERSampler(SignalSampler):
 
     def _sort(self) -> None:
         """Give every written slot its true rank."""
-        slots = self._priorities.isfinite().nonzero().squeeze(1)
-        self._order, places = self._priorities[slots].neg().sort()
+        slots = self._known()
+        self._order, places = self.priorities(slots).neg().sort()
         _, equal = self._order.unique_consecutive(return_counts=True)
         ranks = equal.cumsum(0) - (equal.double() - 1) / 2
         shares = rank_share(ranks, alpha=self._alpha).repeat_interleave(equal)

@@ -26,8 +26,8 @@ from torchrl.data import Storage
 from torchrl_mpfa.checks import POSITIVE, as_mask, check
 from torchrl_mpfa.episodes import episodes_of
 from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.slots import as_slots
 from torchrl_mpfa.samplers.table import SignalTable
-from torchrl_mpfa.samplers.trees import as_slots
 from torchrl_mpfa.signals import TD_ERROR, Signal
 
 EPISODE = Signal("episode", key="episode", known_at="write")
@@ -192,7 +192,7 @@ class ReaPERSampler(SignalSampler):
 
     def _rely(self, table: SignalTable, slots: Tensor) -> None:
         """Write the leaves of all transitions of the episodes that these are of."""
-        priority = self._priorities[: table.size]
+        priority = self.priorities()[: table.size]
         self._number(table)
         columns = [*(table.column[s.name] for s in (TD_ERROR, ENDED)), table.time_column]
         # One at a time, which is much faster than by a list.

@@ -1,4 +1,4 @@
-"""Loops of prioritized replay in C, which a caller takes where they are there.
+"""Loops over trees and rows in C, which a caller takes where they are there.
 
 A wheel has them compiled. Elsewhere they are compiled at their first use, into the user's folder
 of caches. Without a compiler, with ``TORCHRL_MPFA_NATIVE=0`` and on devices other than the CPU,
@@ -11,8 +11,8 @@ import ctypes
 import os
 import warnings
 from collections.abc import Callable
-from ctypes import Structure, c_double, c_int64, c_void_p
-from functools import cache
+from ctypes import c_double, c_int64, c_void_p
+from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
 import torch
@@ -24,42 +24,17 @@ from torchrl_mpfa.native.build import SOURCE, compile_library, library_name
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-class Replay(Structure):
-    """Nodes of the trees and signals of all slots, see ``replay.c``."""
-
-    _fields_ = [
-        *((name, c_void_p) for name in ("nodes", "table")),
-        *((name, c_int64) for name in ("slots", "blocks", "columns")),
-    ]
-
-
-class Fusion(Structure):
-    """Numbers of Eqs. (8) and (21)-(24), see ``replay.c``."""
-
-    _fields_ = [
-        ("weights", c_void_p),
-        *((name, c_int64) for name in ("fused", "learned")),
-        *((name, c_double) for name in ("eps", "alpha", "level")),
-        ("bound", c_int64),
-        *((name, c_double) for name in ("boost", "margin")),
-        ("decay", c_void_p),
-        ("highest", c_double),
-        ("slot", c_int64),
-    ]
-
-
 _P, _I, _D = c_void_p, c_int64, c_double
 _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
-    "set_leaves": (_I, [_P, _I, _I, _I, _I, _P, _P, _I]),
-    "put": (_I, [_P, _I, _I, _P, _P, _P, _I, _I]),
-    "query": (_D, [_P, _I, _I, _I, _I, _I, _I]),
-    "find": (None, [_P, _I, _I, _I, _I, _P, _I, _P]),
+    "put": (_I, [_P, _P, _P, _I, _P, _P, _P, _I]),
+    "query": (_D, [_P, _P, _P, _I, _I, _I]),
+    "find": (None, [_P, _P, _I, _I, _P, _I, _P, _P]),
     "gather": (_I, [_P, _I, _P, _I, _I]),
+    "not_finite": (_I, [_P, _I, _I]),
     "scatter": (_I, [_P, _I, _P, _I, _I]),
-    "sample": (_I, [_P, _I, _P, _I, _D, _P, _P, _P]),
-    "write_new": (_I, [_P, _P, _I, _I, _I, _P, _P, _I, _D, _D, _D]),
-    "stale": (_I, [_P, _I, _P, _I, _P]),
-    "update": (_I, [_P, _P, _P, _I, _I, _P]),
+    "take": (_I, [_P, _I, _I, _I, _P, _I, _I, _P]),
+    "give": (_I, [_P, _I, _I, _P, _I, _I, _P]),
+    "tally": (None, [_P, _I, _I, _P, _I]),
 }
 
 
@@ -68,7 +43,14 @@ def opaque(function: _Function) -> _Function:
 
     What is traced gives up a tensor after its last use, and C would read freed memory.
     """
-    return cast(_Function, torch.compiler.disable(function))
+    disabled = torch.compiler.disable(function)
+
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        # What is disabled takes longer to enter than some of these loops.
+        return (disabled if torch.compiler.is_compiling() else function)(*args, **kwargs)
+
+    return cast(_Function, call)
 
 
 def is_plain(values: Tensor) -> bool:

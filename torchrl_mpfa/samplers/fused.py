@@ -15,11 +15,10 @@ from torchrl.data import Storage, TensorStorage
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level, check_adjustments
 from torchrl_mpfa.checks import LEVEL, NOT_NEGATIVE, check, check_counts, check_index, check_shape
 from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
-from torchrl_mpfa.samplers.compiled import is_compiled, sample_compiled, update_compiled
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
+from torchrl_mpfa.samplers.slots import Steps, as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
-from torchrl_mpfa.samplers.trees import Steps, as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.samplers.weighing import Weighing, restored_weighing, warn_of_mean, weigh
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import REWARD, Signal, as_signals
@@ -196,8 +195,8 @@ class SignalSampler(TreeSampler):
 
     @property
     def compiled(self) -> bool:
-        """True if compiled loops write, sample and update; else PyTorch does."""
-        return is_compiled(self, SignalSampler)
+        """True if compiled loops go through the trees; else TorchRL's do, or a GPU."""
+        return bool(self.trees.compiled)
 
     def _init(self) -> None:
         super()._init()
@@ -250,12 +249,7 @@ class SignalSampler(TreeSampler):
             KeyError: If a reward or signal that is known at the write is missing.
             ValueError: If one is no finite number for each transition, or a signal is negative.
         """
-        rows = self.table.read(data, count)
-        if (name := self.table.missing(rows)) is not None:
-            keys = {signal.name: signal.key for signal in self.table.written}
-            key = keys.get(name, self._reward_key)
-            raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
-        return rows
+        return self.table.read(data, count, whole=True)
 
     def take_rows(self, rows: Tensor | None) -> None:
         """Take rows of :meth:`check_new` for the next :meth:`mark_update`; None: it reads them."""
@@ -265,10 +259,10 @@ class SignalSampler(TreeSampler):
         """Read the signals of new transitions in a storage, and give them the highest priority."""
         self._maybe_init_from_storage(storage)
         slots = check_index(as_slots(index, storage), self._max_capacity)
-        if len(slots):
+        if slots.numel():
             if storage is not None:
                 self._record(slots, storage)
-            super().mark_update(slots)
+            self._mark(slots.to(self.device))
 
     def _record(self, slots: Tensor, storage: Storage) -> None:
         """Keep the signals of new transitions, read from the storage unless they were handed in."""
@@ -287,14 +281,9 @@ class SignalSampler(TreeSampler):
 
         As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, marks overwritten slots.
         """
-        if self.compiled:
-            size = self._filled(storage, batch_size)
-            self.check_positive(size)  # Before random numbers are taken.
-            slots, weight, written_at = sample_compiled(self, size, self._mass(batch_size))
-        else:
-            slots, weight = self._sampled(storage, batch_size)
-            self.table.count_replay(slots)
-            written_at = self.table.written_at(slots)
+        slots, weight = self._sampled(storage, batch_size)
+        self.table.count_replay(slots)
+        written_at = self.table.written_at(slots)
         self._last_batch = (slots, weight)
         info = {"priority_weight": weight, "written_at": written_at}
         return in_dimensions_of(storage, slots), info
@@ -354,12 +343,6 @@ class SignalSampler(TreeSampler):
         slots = as_slots(index, storage)
         if slots.numel() == 0:
             return 0
-        if self.compiled and (batches == 1 or self._takes_batches()):
-            updated = update_compiled(self, slots, signals, written_at, batches)
-            if updated is not None:
-                self._weighing, highest, slot = updated
-                self.keep_highest(highest, slot)
-                return 0
         slots = slots.to(table.device)
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
         stale = 0 if live is None else live.numel() - slots.numel()
@@ -369,7 +352,7 @@ class SignalSampler(TreeSampler):
         if slots.numel() == 0:
             return stale
         # One group of all batches where that is allowed, else a group for each batch.
-        per_group = batches if stale == 0 and self._takes_batches() else 1
+        per_group = batches if batches > 1 and stale == 0 and self._takes_batches() else 1
         groups = [(slots, rows)] if per_group > 1 else by_batch(sizes, slots, rows)
         weighing, priorities = self._weighing, []
         for group_slots, group_rows in groups:
@@ -385,7 +368,7 @@ class SignalSampler(TreeSampler):
 
         # Nothing has changed so far, so that a call that raises leaves everything as it was.
         self._weighing = weighing
-        table.rows.index_copy_(0, slots, rows)
+        table.learn(slots, rows)
         self._set(slots, priority, highest)  # Eq. (8).
         return stale
 
@@ -400,15 +383,14 @@ class SignalSampler(TreeSampler):
         self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing, batches: int
     ) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
-        shape = (batches, -1) if batches > 1 else slots.shape
-        priority, slots = self.combined(rows, weighing).view(shape), slots.view(shape)
-        facts = BatchFacts(
-            reward=rows.select(1, table.reward_column).view(shape),
-            replay_count=rows.select(1, table.count_column).view(shape),
-            index=slots,
-            level=weighing.mean_reward if self.positive_above == "mean" else self.positive_above,
-            written_at=rows.select(1, table.time_column).view(shape),
-        )
+        priority = self.combined(rows, weighing)
+        *_, reward, replay_count, written_at = rows.unbind(1)
+        numbers = [priority, reward, replay_count, slots, written_at]
+        if batches > 1:
+            numbers = [number.view(batches, -1) for number in numbers]
+        priority, reward, replay_count, slots, written_at = numbers
+        level = weighing.mean_reward if self.positive_above == "mean" else self.positive_above
+        facts = BatchFacts(reward, replay_count, slots, level, written_at)
         for place, adjust in enumerate(self.adjustments):
             if weighing.counted:
                 facts = replace(facts, counted=weighing.counted[place])

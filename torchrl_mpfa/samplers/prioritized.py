@@ -20,20 +20,9 @@ from torchrl_mpfa.checks import (
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
+from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each, random_shares
 from torchrl_mpfa.samplers.states import SavedTrees
-from torchrl_mpfa.samplers.trees import (
-    Leaves,
-    MinLeaves,
-    as_slots,
-    in_dimensions_of,
-    last_of_each,
-    leaves_of,
-    make_trees,
-    put_leaves,
-    random_shares,
-    set_leaves,
-    slots_at,
-)
+from torchrl_mpfa.samplers.trees import is_learned, make_trees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _LOG_POSITIVE = math.log(1e-200)
@@ -110,11 +99,10 @@ class TreeSampler(SavedTrees):
         super().__init__(capacity, float(alpha), float(beta), float(eps), *rest)
 
     def _init(self) -> None:
-        # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
-        # over the negated priorities has it at its root. It leaves out fresh transitions: they
-        # would hand on the highest priority that they were given, and one outlier would stay.
-        trees, self._apart = make_trees(self._max_capacity, self.device)
-        self._sum_tree, self._min_tree, self._max_tree = trees
+        # TorchRL finds the highest priority in the buffer by reading every leaf; here it is at a
+        # root. It leaves out fresh transitions: they would hand on the highest priority that they
+        # were given, and one outlier would stay.
+        self.trees = make_trees(self._max_capacity, self.device)
         self._highest: float | None = None
         self._highest_slot: int | None = None
         # True on a GPU while all priorities are surely positive, so that sampling need not wait.
@@ -165,7 +153,8 @@ class TreeSampler(SavedTrees):
 
     def _check_alpha(self, value: float) -> None:
         """Reject an exponent by which priorities vanish or overflow."""
-        written = self._priorities[self._priorities > 0]
+        written = self.priorities()
+        written = written[written > 0]
         before, self._alpha = self._alpha, value
         leaf = self._leaf(written)
         self._alpha = before
@@ -192,8 +181,7 @@ class TreeSampler(SavedTrees):
             return None, None
         if not self._max_priority_within_buffer or self._alpha == 0:
             return max(highest - self._eps, 0.0), self._highest_slot
-        leaves = leaves_of(self._max_tree, torch.arange(self._max_capacity, device=self.device))
-        return max(highest - self._eps, 0.0), int(leaves.argmin())
+        return max(highest - self._eps, 0.0), int(self.trees.priorities.nan_to_num(-1.0).argmax())
 
     @_max_priority.setter
     def _max_priority(self, value: tuple[float | None, int | None] | None) -> None:
@@ -205,8 +193,8 @@ class TreeSampler(SavedTrees):
         """Return the highest priority, eps included; None before the first update."""
         # With alpha = 0 all slots are sampled alike, and TorchRL keeps the highest ever seen.
         if self._max_priority_within_buffer and self._alpha > 0:
-            highest = -self._max_tree.query(0, self._max_capacity)
-            return None if highest < 0 else float(highest)
+            highest = float(self.trees.highest())
+            return None if highest < 0 else highest
         return self._highest
 
     @property
@@ -220,7 +208,8 @@ class TreeSampler(SavedTrees):
 
         They include eps and precede alpha, and are NaN where nothing was written.
         """
-        return self._priorities.clone() if index is None else self._priorities[as_slots(index)]
+        kept = self.trees.priorities
+        return (kept if index is None else kept[as_slots(index)]).abs()
 
     @property
     def divisible(self) -> bool:
@@ -266,18 +255,17 @@ class TreeSampler(SavedTrees):
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample out of the first ``size`` slots: slots and weights, both of shape ``[B]``."""
+        lowest = self.trees.lowest(size)
         if not self._positive:
-            self.check_positive(size)
+            self._check_positive(self.trees.sum(size), lowest)
             # A GPU is waited for once, and again after a priority that may be too low.
-            self._positive = isinstance(self._sum_tree, Leaves)
-        lowest = self._min_tree.query(0, size)
-        index = self._proportional(self._sum_tree, size, batch_size)
-        leaf = leaves_of(self._sum_tree, index)
+            self._positive = self.trees.waits
+        index, leaf = self._proportional(self.trees, size, batch_size)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
-    def check_positive(self, size: int) -> None:
+    @staticmethod
+    def _check_positive(total: Any, lowest: Any) -> None:
         """Reject slots of which none can be sampled, or one has no priority."""
-        total, lowest = self._sum_tree.query(0, size), self._min_tree.query(0, size)
         if not bool((total > 0) & (lowest > 0)):
             raise RuntimeError(
                 f"every priority must be positive to sample, got a sum of {total} and a lowest "
@@ -299,8 +287,8 @@ class TreeSampler(SavedTrees):
             >>> sampler.batch_weights(2).tolist()
             [1.0, 0.5]
         """
-        leaf = leaves_of(self._sum_tree, torch.arange(size, device=self.device))
-        weight = importance_weights(leaf, beta=self._beta, lowest=self._min_tree.query(0, size))
+        leaf = self.trees.leaves(torch.arange(size, device=self.device))
+        weight = importance_weights(leaf, beta=self._beta, lowest=self.trees.lowest(size))
         return torch.where(leaf > 0, weight, torch.nan)
 
     def _uniform(self, size: int, batch_size: int) -> Tensor:
@@ -309,9 +297,10 @@ class TreeSampler(SavedTrees):
             return self._mass(batch_size).mul_(size).long().clamp_max_(size - 1)
         return torch.randint(size, (batch_size,), **self._random())
 
-    def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
-        """Sample slots in proportion to the leaves of a tree of sums, shape ``[B]``."""
-        return slots_at(self._mass(batch_size), tree, size)
+    def _proportional(self, trees: Any, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+        """Sample slots in proportion to the leaves of trees; slots and leaves, both ``[B]``."""
+        slots, leaf = trees.find(self._mass(batch_size), size)
+        return slots, leaf
 
     def _mass(self, batch_size: int) -> Tensor:
         """Sample shares of the total priority to look up, in [0, 1), shape ``[B]``."""
@@ -324,9 +313,12 @@ class TreeSampler(SavedTrees):
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give fresh transitions the highest priority, or raise as :meth:`update_priority`."""
         self._maybe_init_from_storage(storage)
-        slots = check_index(as_slots(index, storage), self._max_capacity).to(self.device)
-        if len(slots) == 0:
-            return
+        slots = check_index(as_slots(index, storage), self._max_capacity)
+        if slots.numel():
+            self._mark(slots.to(self.device))
+
+    def _mark(self, slots: Tensor) -> None:
+        """Give the transitions in slots the highest priority."""
         priority = self._fresh_priority()
         if self._highest is None:
             self.keep_highest(float(priority), int(slots[0]))
@@ -337,8 +329,8 @@ class TreeSampler(SavedTrees):
         """Return the priority of a fresh transition, eps included; a GPU is not waited for."""
         first = 1.0 + self._eps
         within = self._max_priority_within_buffer and self._alpha
-        if isinstance(self._max_tree, MinLeaves) and within:
-            highest = -self._max_tree.query(0, self._max_capacity)
+        if self.trees.waits and within:
+            highest = self.trees.highest()
             return highest.where(highest >= 0, first)
         priority = self._highest_priority()
         return first if priority is None else priority
@@ -400,7 +392,7 @@ class TreeSampler(SavedTrees):
         TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
         transitions that they find in a storage, and for batches without a priority.
         """
-        fresh = leaves_of(self._max_tree, slots) > 0
+        fresh = ~is_learned(self.trees.priorities[slots])
         return fresh & (value.float() == torch.tensor(self.default_priority, device="cpu").float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
@@ -417,7 +409,7 @@ class TreeSampler(SavedTrees):
         """Write priorities that an update gave, eps included, of which this is the highest."""
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
-            stored = self._priorities[slots]  # Of a slot that is named twice the last one.
+            stored = self.priorities(slots)  # Of a slot that is named twice the last one.
             self.keep_highest(float(stored.max()), int(slots[stored.argmax()]))
 
     def keep_highest(self, highest: float, slot: int) -> None:
@@ -427,13 +419,13 @@ class TreeSampler(SavedTrees):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""
-        leaf, trees = self._leaf(priority), (self._sum_tree, self._min_tree, self._max_tree)
-        put_leaves(trees, self._apart, slots, leaf, priority, learned=learned)
+        leaf = self._leaf(priority)
+        self.trees.put(slots, leaf, priority if learned else -priority)
         self._follow(slots, leaf)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         """Write leaves, to which slots are sampled in proportion, shape ``[B]``."""
-        set_leaves(slots, leaf, self._sum_tree, self._min_tree)
+        self.trees.put(slots, leaf)
         self._follow(slots, leaf)
 
     def _follow(self, slots: Tensor, leaf: Tensor) -> None:
@@ -445,6 +437,10 @@ class TreeSampler(SavedTrees):
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         """Follow a new alpha; unlike TorchRL's, exact, and from 0 as well."""
-        slots = self._priorities.isfinite().nonzero().squeeze(1)
+        slots = self._known()
         if len(slots):
-            self._write_leaves(slots, self._leaf(self._priorities[slots]))
+            self._write_leaves(slots, self._leaf(self.priorities(slots)))
+
+    def _known(self) -> Tensor:
+        """Return the slots that have a priority, shape ``[B]``."""
+        return self.trees.priorities.isfinite().nonzero().squeeze(1)

@@ -13,7 +13,7 @@ from torchrl.data import Storage
 from torchrl_mpfa.checks import as_mask, check_counts, check_index, unknown
 from torchrl_mpfa.episodes import follows
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.samplers.trees import as_slots, leaves_of, set_leaves
+from torchrl_mpfa.samplers.slots import as_slots
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.storages.schema import as_path
 
@@ -173,7 +173,7 @@ class SignalSliceSampler(SignalSampler):
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
         self.check_batch_size(batch_size)
         size = len(storage)
-        if size and self._sum_tree.query(0, size) == 0:
+        if size and self.trees.sum(size) == 0:
             raise RuntimeError(
                 f"no trajectory in the buffer has {self.slice_len} steps that follow each other: "
                 f"write longer ones, with {self.end_key!r} true only where one ends; those of "
@@ -184,12 +184,12 @@ class SignalSliceSampler(SignalSampler):
         self._lengths = inside.sum(1)
         return slots[inside], weight.repeat_interleave(self._lengths)
 
-    def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
-        starts = super()._proportional(tree, size, batch_size)
+    def _proportional(self, trees: Any, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+        starts, leaf = super()._proportional(trees, size, batch_size)
         # Rounding can end at a leaf of 0 next to the right one.
-        while len(wrong := (leaves_of(tree, starts) == 0).nonzero().squeeze(1)):
-            starts[wrong] = super()._proportional(tree, size, len(wrong))
-        return starts
+        while len(wrong := (leaf == 0).nonzero().squeeze(1)):
+            starts[wrong], leaf[wrong] = super()._proportional(trees, size, len(wrong))
+        return starts, leaf
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give new steps the highest priority, and record where trajectories end.
@@ -247,13 +247,12 @@ class SignalSliceSampler(SignalSampler):
 
     def _refresh(self, starts: Tensor) -> None:
         """Write the present leaves of slices, by their starts, shape ``[S]``."""
-        starts = starts[self._priorities[starts].isfinite()]
+        priorities = self.priorities()
+        starts = starts[priorities[starts].isfinite()]
         for part in starts.split(_AT_ONCE):
-            priority, full = self._of_slices(part, self._priorities, self._joined, self._stride)
-            leaf = self._leaf(priority)
-            set_leaves(part, leaf.where(full, 0.0), self._sum_tree)
+            priority, full = self._of_slices(part, priorities, self._joined, self._stride)
             # What cannot be sampled is not the lowest.
-            set_leaves(part, leaf.where(full, math.inf), self._min_tree)
+            self.trees.put(part, self._leaf(priority).where(full, -0.0))
 
     def _of_slices(
         self, starts: Tensor, priorities: Tensor, joined: Tensor, stride: int

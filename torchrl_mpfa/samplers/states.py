@@ -12,10 +12,10 @@ from torch import Tensor
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_not_negative
-from torchrl_mpfa.samplers.trees import leaves_of, set_leaves
+from torchrl_mpfa.samplers.trees import is_learned
 from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
 
-FORMAT = 4
+FORMAT = 5
 """Version of saved states."""
 
 
@@ -77,34 +77,26 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
     """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves and loads."""
 
     KIND = "proportional"
-    SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest", "_highest_slot", "_priorities")
+    SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest", "_highest_slot")
     _alpha: float
     _beta: float
-    _sum_tree: Any
-    _apart: Any
-
-    @property
-    def _priorities(self) -> Tensor:
-        """Priorities, eps included and before alpha, NaN where nothing was written, ``[N]``."""
-        # Beside compiled trees they are in one tensor, of which a pickle would copy a view apart.
-        return self._sum_tree.priorities if self._apart is None else self._apart
-
-    @_priorities.setter
-    def _priorities(self, value: Tensor) -> None:
-        self._priorities.copy_(value)
+    trees: Any
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next batches depend on but for the generator, on the CPU."""
+        """Return everything that the next batches depend on but for the generator, on the CPU.
+
+        ``_learned`` is true where a priority was learned, and ``_leaves`` are -0.0 where a slot
+        cannot be sampled.
+        """
         slots = torch.arange(self._max_capacity, device=self.device)
-        leaves = {
-            name: leaves_of(getattr(self, name), slots).cpu() for name in ("_sum_tree", "_min_tree")
-        }
+        kept = self.trees.priorities
         return {
             **super().state_dict(),
             "_schema_version": self._STATE_SCHEMA_VERSION,
             "_max_capacity": self._max_capacity,
-            "_learned": leaves_of(self._max_tree, slots).cpu() <= 0,
-            **leaves,
+            "_priorities": kept.abs().cpu(),
+            "_learned": is_learned(kept).cpu(),
+            "_leaves": self.trees.leaves(slots).cpu(),
         }
 
     def dumps(self, path: str | Path) -> None:
@@ -115,26 +107,24 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
         (Path(path) / "sampler_metadata.json").write_text(text, encoding="utf-8")
 
     def _restore(self, state: dict[str, Any]) -> None:
-        names, size = ("_learned", "_sum_tree", "_min_tree"), self._max_capacity
+        names, size = ("_priorities", "_learned", "_leaves"), self._max_capacity
         check_saved("sampler", state, names, _max_capacity=size)
         self._init()
         super()._restore(state)
         check(NOT_NEGATIVE, alpha=self._alpha, beta=self._beta, eps=self._eps)
+        kept = self.trees.priorities
+        priorities, leaves = (alike(name, state[name], kept) for name in ("_priorities", "_leaves"))
+        learned = alike("_learned", state["_learned"], kept.isnan())
         # NaN where nothing was written, and there trees are left as they are made.
-        slots = (~self._priorities.isnan()).nonzero().squeeze(1)
-        check_not_negative("'_priorities' of the saved sampler", self._priorities[slots])
-        learned = alike("_learned", state["_learned"], self._priorities.isnan())[slots]
-        for name in ("_sum_tree", "_min_tree"):
-            leaf = alike(name, state[name], self._priorities)[slots]
-            # A leaf of what cannot be sampled is infinite among the lowest.
-            check_not_negative(f"{name!r} of the saved sampler", leaf.where(leaf != math.inf, 0.0))
-            if len(slots):
-                set_leaves(slots, leaf, getattr(self, name))
-        if not bool(self._sum_tree.query(0, size) < math.inf):
-            raise ValueError("'_sum_tree' of the saved sampler must have a finite sum, got inf")
-        if bool(learned.any()):
-            slots = slots[learned]
-            set_leaves(slots, -self._priorities[slots], self._max_tree)
+        slots = (~priorities.isnan()).nonzero().squeeze(1)
+        priorities, leaves = priorities[slots], leaves[slots]
+        check_not_negative("'_priorities' of the saved sampler", priorities)
+        check_not_negative("'_leaves' of the saved sampler", leaves)
+        if len(slots):
+            signed = torch.where(learned[slots], priorities, -priorities)
+            self.trees.put(slots, leaves, signed)
+        if not bool(self.trees.sum(size) < math.inf):
+            raise ValueError("'_leaves' of the saved sampler must have a finite sum, got inf")
 
 
 def alike(name: str, saved: Any, own: Any) -> Any:

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -22,11 +21,13 @@ from torchrl_mpfa.checks import (
     check_not_negative,
     check_shape,
 )
+from torchrl_mpfa.native import address, find_loops, loops, opaque
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
 Agents = Literal["max", "mean"]
 """Number of a transition out of those of its agents: the largest one, or their mean."""
+_LACKS = "the transitions lack {!r}: no finite entry at {!r}"
 
 
 class SignalTable:
@@ -123,39 +124,46 @@ class SignalTable:
         """Return rows of transitions of which nothing is known yet."""
         return self._blank.to(device).expand(count, -1).clone()
 
-    def read(self, data: Any, count: int) -> Tensor:
-        """Return checked rows for new transitions, with NaN for missing entries.
+    def read(self, data: Any, count: int, *, whole: bool = False) -> Tensor:
+        """Return checked rows for new transitions, with NaN for entries that are missing.
 
         They are on the device of the data, so that checks wait for no other device.
+
+        Raises:
+            KeyError: If ``whole`` and an entry is missing.
+            ValueError: If one is no finite number for each transition, or a signal is negative.
         """
         reward = self._column(data, self.reward_key, "reward", count)
         rows = self.blank(count, "cpu" if reward is None else reward.device)
-        if reward is not None:
-            rows[:, self.reward_column] = reward
         for signal in self.written:
             same = signal.key == self.reward_key
             value = reward if same else self._column(data, signal.key, signal.name, count)
             if value is not None:
-                rows[:, self.column[signal.name]] = _written_priority(signal, value)
+                rows.select(1, self.column[signal.name]).copy_(_written_priority(signal, value))
+            elif whole:
+                raise KeyError(_LACKS.format(signal.name, signal.key))
+        if reward is not None:
+            rows.select(1, self.reward_column).copy_(reward)
+        elif whole:
+            raise KeyError(_LACKS.format("reward", self.reward_key))
         return rows
 
     def fill_learned(
         self, rows: Tensor, signals: Mapping[str, Tensor], live: Tensor | None, sizes: Sequence[int]
     ) -> None:
         """Write learned signals of live rows in copies of them, batch by batch."""
-        count = rows.shape[0] if live is None else len(live)
+        count = rows.shape[0] if live is None else live.shape[0]
         for signal in self.learned:
             name = signal.name
             if name not in signals:
                 raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
             value = self._one_each(f"signal {name!r}", signals[name].detach(), count)
-            value = value.to(rows.device)
-            value = value if live is None else value[live]
+            value = value if live is None else value.to(live.device)[live]
             column = rows.select(1, self.column[name])
             if signal.priority is None:
                 column.copy_(value)
                 continue
-            for one, into in by_batch(sizes, value, column):
+            for one, into in by_batch(sizes, value.to(rows.device), column):
                 if len(one):
                     into.copy_(_priority(signal, one))
 
@@ -164,8 +172,8 @@ class SignalTable:
         if rows.numel() == 0:
             return
         # A NaN makes both of these NaN, so that one pass finds any wrong number.
-        chosen = rows[:, self.fused].contiguous()
-        low, high = bounds(chosen)
+        chosen = rows[:, self.fused]
+        low, high = bounds(chosen.T)
         if low >= 0 and high < math.inf:
             return
         written = {signal.name for signal in self.written}
@@ -183,11 +191,16 @@ class SignalTable:
         if type(batches) is not int or batches < 1:
             check_counts(batches=batches)
         count = slots.numel()
-        if check_index(slots, filled).numel() < count:
-            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
         if count % batches:
             raise ValueError(f"{count} slots cannot make {batches} equal batches")
-        rows, sizes = self.rows.index_select(0, slots), [count // batches] * batches
+        rows, sizes = (
+            self._taken(slots, 0, self.rows.shape[1], filled),
+            [count // batches] * batches,
+        )
+        if rows is None:
+            if check_index(slots, filled).numel() < count:
+                raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
+            rows = self.rows.index_select(0, slots)
         if written_at is None:
             return rows, slots, None, sizes
         if written_at.numel() != count:
@@ -231,15 +244,6 @@ class SignalTable:
         # With its sign, which says whether a reward is positive.
         return of_agents.gather(1, of_agents.abs().argmax(1, keepdim=True)).squeeze(1)
 
-    def missing(self, rows: Tensor) -> str | None:
-        """Return the name of the first entry known at the write that some rows lack, or None."""
-        # Of two rewards the signal counts first: it is the one that an error should name.
-        for name in [*(s.name for s in self.written), "reward"]:
-            column = self.column.get(name, self.reward_column)
-            if rows[:, column].isnan().any():
-                return name
-        return None
-
     def write(self, index: Tensor, rows: Tensor) -> None:
         """Write new transitions in their slots, and reset all else of these slots."""
         count = len(rows)
@@ -257,17 +261,53 @@ class SignalTable:
         self.rows[index] = rows
         self.writes += count
 
+    @property
+    def _by_c(self) -> bool:
+        """True if compiled loops read and write the rows."""
+        return self.rows.is_cpu and find_loops() is not None
+
+    @opaque
+    def _taken(self, slots: Tensor, first: int, count: int, filled: int) -> Tensor | None:
+        """Return so many columns of slots, shape ``[B, count]``; each lies in one piece.
+
+        None where PyTorch has to take them, or a slot is not filled.
+        """
+        if not self._by_c:
+            return None
+        slots = slots.contiguous()
+        columns = torch.empty((count, slots.numel()), dtype=torch.double, device="cpu")
+        batch = address(slots, torch.long), slots.numel(), min(filled, self.capacity)
+        place = self.rows.data_ptr(), self.rows.shape[1], first, count
+        return None if loops().take(*place, *batch, columns.data_ptr()) else columns.T
+
+    @opaque
+    def learn(self, slots: Tensor, rows: Tensor) -> None:
+        """Write the learned signals of rows of :meth:`live_rows`; the last of a slot counts."""
+        learned = rows[:, : len(self.learned)]
+        if self._by_c:
+            columns, slots = learned.T.contiguous(), slots.contiguous()
+            batch = address(slots, torch.long), slots.numel(), self.capacity
+            place = self.rows.data_ptr(), self.rows.shape[1], len(self.learned)
+            loops().give(*place, *batch, columns.data_ptr())
+        else:
+            self.rows[:, : len(self.learned)].index_copy_(0, slots, learned)
+
+    @opaque
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
-        if self.rows.is_cpu:
-            np.add.at(self.rows.numpy()[:, self.count_column], index.numpy(), 1.0)
+        if self._by_c:
+            place = self.rows.data_ptr(), self.rows.shape[1], self.count_column
+            loops().tally(*place, address(index, torch.long), index.numel())
         else:
             one = torch.ones(len(index), dtype=torch.double, device=self.device)
             self.rows.select(1, self.count_column).index_add_(0, index, one)
 
     def written_at(self, index: Tensor) -> Tensor:
         """Return the time of writing of each slot, a count of writes, shape ``[B]``."""
-        return self.rows.select(1, self.time_column).index_select(0, index)
+        times = self._taken(index, self.time_column, 1, self.capacity)
+        if times is None:
+            return self.rows.select(1, self.time_column).index_select(0, index)
+        return times.squeeze(1)
 
     def replay_counts(self, index: Tensor) -> Tensor:
         """Return the replays of each slot, shape ``[B]``."""

@@ -1,125 +1,228 @@
-"""Slots and leaves: slots in TorchRL's forms, and their leaves in segment trees or flat arrays."""
+"""Leaves and priorities of all slots, and the sums, lowest and highest of them.
+
+A leaf is a priority to the power of alpha: its slot is sampled in proportion to it. A leaf of -0.0
+cannot be sampled, and is no lowest one. A priority has a negative sign until it was learned, and
+then is no highest one. Three kinds of trees do the same: in C, TorchRL's, and on a GPU none.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from tensordict import is_tensor_collection
 from torch import Tensor
-from torchrl.data import Storage
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
 from torchrl_mpfa.native import address, find_loops, loops, opaque
-from torchrl_mpfa.storages.schema import as_integers
 
-_ORDERED = 2048
-"""Rows up to which writing by index keeps their order."""
-_BLOCK = 16
-"""Leaves that share the lowest node of a compiled tree, also in ``replay.c``."""
+_WIDE = 16
+"""Children of a node of compiled trees, also in ``replay.c``."""
+_MOST = torch.finfo(torch.double).max
+"""The lowest of no leaves, as in TorchRL."""
+_SUM, _LOWEST, _HIGHEST = range(3)
 
 
-class CompiledTree:
-    """A segment tree whose loops are compiled, with the interface of TorchRL's but for tensors.
+def make_trees(capacity: int, device: torch.device) -> CompiledTrees | PlainTrees:
+    """Return trees without leaves: compiled ones on the CPU, where a compiler was found."""
+    if device.type == "cpu" and find_loops() is not None:
+        return CompiledTrees(capacity)
+    return PlainTrees(capacity, device)
 
-    Sums and minima are the same as there to the last bit.
+
+class CompiledTrees:
+    """Trees whose loops are compiled, equal to TorchRL's to the last bit.
 
     Args:
         capacity: Number of slots ``N``.
-        nodes: Where the nodes are, with those of other trees beside them; by default alone.
-        column: Place among the other trees.
+
+    Examples:
+        >>> trees = CompiledTrees(3) if find_loops() else PlainTrees(3, torch.device("cpu"))
+        >>> leaf = torch.tensor([1.0, 2.0], dtype=torch.double)
+        >>> trees.put(torch.tensor([0, 2]), leaf, priority=leaf)
+        >>> float(trees.sum(3)), float(trees.lowest(3)), float(trees.highest())
+        (3.0, 1.0, 2.0)
+        >>> trees.find(torch.tensor([0.3, 0.4], dtype=torch.double), 3)[0].tolist()
+        [0, 2]
     """
 
-    EMPTY: float
-    """Leaf of a slot that was never written."""
-    MINIMUM: bool
+    compiled = True
+    waits = False
 
     @torch.inference_mode(False)
-    def __init__(self, capacity: int, nodes: Tensor | None = None, column: int = 0) -> None:
-        self.size, self.blocks = capacity, _blocks(capacity)
-        self.nodes = _nodes(capacity, 1) if nodes is None else nodes
-        self._column = column
-        self.nodes[:, column] = self.EMPTY
-
-    @property
-    def _place(self) -> tuple[int, int, int]:
-        """Address of the first node, numbers from node to node, and blocks of leaves."""
-        start = address(self.nodes, torch.double) + 8 * self._column
-        return start, self.nodes.shape[1], self.blocks
+    def __init__(self, capacity: int) -> None:
+        self._size = capacity
+        self._leaf = _filled(-0.0, capacity)
+        self._priority = _filled(torch.nan, capacity)
+        # Of each level the sums, then the lowest and the highest, until one node is left.
+        levels: list[Tensor] = []
+        count = capacity
+        while not levels or count > 1:
+            count = -(-count // _WIDE)
+            levels += [_filled(0.0, count), _filled(_MOST, count), _filled(_MOST, count)]
+        self._nodes = torch.cat(levels)
 
     @property
     def priorities(self) -> Tensor:
-        """Priorities beside the leaves of three trees, a view, shape ``[N]``."""
-        first = 2 * self.blocks
-        return self.nodes[first : first + self.size, 3]
+        """Priorities, negative if never learned, NaN if never written, shape ``[N]``."""
+        return self._priority[: self._size]
 
-    def __getitem__(self, slots: Tensor) -> Tensor:
-        return self.nodes.select(1, self._column)[slots + 2 * self.blocks]
-
-    @opaque
-    def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
-        slots, leaf = slots.contiguous(), leaf.double().expand(slots.shape).contiguous()
-        batch = address(slots, torch.long), address(leaf, torch.double), slots.numel()
-        if loops().set_leaves(*self._place, self.MINIMUM, self.size, *batch):
-            raise IndexError(f"slots must be in [0, {self.size}), got {slots.tolist()}")
+    def leaves(self, slots: Tensor) -> Tensor:
+        """Return leaves of slots, shape ``[B]``."""
+        return self._leaf.index_select(0, slots)
 
     @opaque
-    def query(self, start: int, end: int) -> float:
-        """Return the sum or minimum of the leaves from ``start`` to before ``end``."""
-        result: float = loops().query(*self._place, self.MINIMUM, self.size, start, end)
+    def put(self, slots: Tensor, leaf: Tensor, priority: Tensor | None = None) -> None:
+        """Set leaves of slots, and their priorities where these are given, each ``[B]``."""
+        slots, leaf = slots.contiguous(), leaf.double().contiguous()
+        priority = None if priority is None else priority.double().contiguous()
+        values = None if priority is None else address(priority, torch.double)
+        if loops().put(
+            self._leaf.data_ptr(),
+            self._priority.data_ptr(),
+            self._nodes.data_ptr(),
+            self._size,
+            address(slots, torch.long),
+            address(leaf, torch.double),
+            values,
+            slots.numel(),
+        ):
+            raise IndexError(f"slots must be in [0, {self._size}), got {slots.tolist()}")
+
+    @opaque
+    def find(self, shares: Tensor, size: int) -> tuple[Tensor, Tensor]:
+        """Return the slots at shares of the sum of the first leaves, and their leaves, ``[B]``."""
+        slots = torch.empty(shares.shape, dtype=torch.long, device="cpu")
+        leaves = torch.empty_like(shares)
+        loops().find(
+            self._leaf.data_ptr(),
+            self._nodes.data_ptr(),
+            self._size,
+            min(size, self._size),
+            address(shares, torch.double),
+            shares.numel(),
+            slots.data_ptr(),
+            leaves.data_ptr(),
+        )
+        return slots, leaves
+
+    def sum(self, size: int) -> float:
+        """Return the sum of the first leaves."""
+        return self._query(_SUM, size)
+
+    def lowest(self, size: int) -> float:
+        """Return the lowest of the first leaves."""
+        return self._query(_LOWEST, size)
+
+    def highest(self) -> float:
+        """Return the highest priority that was learned; negative if none was."""
+        return -self._query(_HIGHEST, self._size)
+
+    @opaque
+    def _query(self, kind: int, size: int) -> float:
+        """Return what the root has of the first leaves."""
+        parts = self._leaf.data_ptr(), self._priority.data_ptr(), self._nodes.data_ptr()
+        result: float = loops().query(*parts, kind, self._size, size)
         return result
 
 
-class SumTree(CompiledTree):
-    """A segment tree of sums.
+def _filled(number: float, count: int) -> Tensor:
+    """Return so many times a number, and more up to whole nodes."""
+    size = -(-count // _WIDE) * _WIDE
+    return torch.full((size,), number, dtype=torch.double, device="cpu")
+
+
+class PlainTrees:
+    """TorchRL's trees on the CPU; on other devices leaves, which are passed over.
+
+    A GPU takes as long to start a kernel as to pass over some hundred thousand numbers, and a tree
+    over a million slots asks for several kernels on each of its twenty levels.
+
+    Args:
+        capacity: Number of slots ``N``.
+        device: Where they are.
+    """
+
+    compiled = False
+
+    @torch.inference_mode(False)
+    def __init__(self, capacity: int, device: torch.device) -> None:
+        self._size = capacity
+        self.waits = device.type != "cpu"
+        """True if the host waits for a device that it asks for a number."""
+        self.priorities = torch.full((capacity,), torch.nan, dtype=torch.double, device=device)
+        """Priorities, negative if never learned, NaN if never written, shape ``[N]``."""
+        if self.waits:
+            self._sums: Any = SumLeaves(capacity, device)
+            self._lows, self._highs = (MinLeaves(capacity, device) for _ in range(2))
+        else:
+            self._sums = SumSegmentTreeFp64(capacity)
+            self._lows, self._highs = (MinSegmentTreeFp64(capacity) for _ in range(2))
+
+    def leaves(self, slots: Tensor) -> Tensor:
+        """Return leaves of slots, shape ``[B]``."""
+        if self.waits:
+            leaves: Tensor = self._sums[slots]
+            return leaves
+        # Given a tensor, the binding first tries it as a number, and spends ten times as long on
+        # the error as on the leaves. Of an array it reads the memory from the start.
+        return torch.from_numpy(self._sums[slots.contiguous().numpy()])
+
+    def put(self, slots: Tensor, leaf: Tensor, priority: Tensor | None = None) -> None:
+        """Set leaves of slots, and their priorities where these are given, each ``[B]``."""
+        leaf = leaf.double()
+        self._set(self._sums, slots, leaf)
+        self._set(self._lows, slots, leaf.where(~leaf.signbit(), _MOST))
+        if priority is not None:
+            priority = priority.double()
+            self.priorities.index_copy_(0, slots, priority)
+            learned = is_learned(priority)
+            self._set(self._highs, slots, -priority.where(learned, -_MOST))
+
+    def _set(self, tree: Any, slots: Tensor, leaf: Tensor) -> None:
+        """Set leaves of one tree; of a repeated slot the last one counts."""
+        if self.waits:
+            tree[slots] = leaf
+        else:
+            tree[slots.contiguous().numpy()] = leaf.contiguous().numpy()
+
+    def find(self, shares: Tensor, size: int) -> tuple[Tensor, Tensor]:
+        """Return the slots at shares of the sum of the first leaves, and their leaves, ``[B]``."""
+        slots = self._sums.scan_lower_bound(shares * self._sums.query(0, size))
+        # Rounding can carry the last bit of mass past the last slot.
+        slots = slots.clamp_max_(min(size, self._size) - 1)
+        return slots, self.leaves(slots)
+
+    def sum(self, size: int) -> Any:
+        """Return the sum of the first leaves; on a GPU of shape ``[]``."""
+        return self._sums.query(0, size)
+
+    def lowest(self, size: int) -> Any:
+        """Return the lowest of the first leaves; on a GPU of shape ``[]``."""
+        return self._lows.query(0, size)
+
+    def highest(self) -> Any:
+        """Return the highest priority that was learned, negative if none was."""
+        return -self._highs.query(0, self._size)
+
+
+def is_learned(priorities: Tensor) -> Tensor:
+    """Return True where a priority was learned, shape ``[B]``."""
+    return (priorities >= 0) & ~priorities.signbit()
+
+
+class SumLeaves:
+    """Leaves on a GPU in place of TorchRL's tree of sums, with its interface.
 
     Examples:
-        >>> tree = SumTree(3) if find_loops() else SumLeaves(3)
+        >>> tree = SumLeaves(3, torch.device("cpu"))
         >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
-        >>> float(tree.query(0, 3))
-        3.0
+        >>> tree.query(0, 3), tree.scan_lower_bound(torch.tensor([0.5, 1.5], dtype=torch.double))
+        (tensor(3., dtype=torch.float64), tensor([0, 2]))
     """
 
-    EMPTY, MINIMUM = 0.0, False
+    EMPTY = -0.0
 
-    @opaque
-    def put(self, slots: Tensor, leaf: Tensor, priority: Tensor, *, learned: bool) -> None:
-        """Set leaves and priorities of slots in this and the two trees beside it, each ``[B]``."""
-        nodes, slots = address(self.nodes, torch.double), slots.contiguous()
-        leaf, priority = (v.double().expand(slots.shape).contiguous() for v in (leaf, priority))
-        values = address(leaf, torch.double), address(priority, torch.double)
-        place = nodes, self.blocks, self.size, address(slots, torch.long)
-        if loops().put(*place, *values, learned, slots.numel()):
-            raise IndexError(f"slots must be in [0, {self.size}), got {slots.tolist()}")
-
-    @opaque
-    def slots_at(self, shares: Tensor, size: int) -> Tensor:
-        """Return the slots at shares of the sum of the first slots, shape ``[B]``."""
-        slots = torch.empty(shares.shape, dtype=torch.long, device="cpu")
-        batch = address(shares, torch.double), shares.numel(), address(slots, torch.long)
-        loops().find(*self._place, self.size, size, *batch)
-        return slots
-
-
-class MinTree(CompiledTree):
-    """A segment tree of minima."""
-
-    EMPTY, MINIMUM = torch.finfo(torch.double).max, True
-
-
-class Leaves:
-    """Leaves of all slots, with the interface of TorchRL's segment trees but for an ``end``.
-
-    They take the place of the trees on devices other than the CPU, and pass over all leaves. A GPU
-    takes as long to start a kernel as to pass over some hundred thousand numbers, and a tree over
-    a million slots asks for several kernels on each of its twenty levels.
-    """
-
-    EMPTY: float
-    """Leaf of a slot that was never written."""
-
-    def __init__(self, capacity: int, device: torch.device | str = "cpu") -> None:
+    def __init__(self, capacity: int, device: torch.device) -> None:
         self._leaves = torch.full((capacity,), self.EMPTY, dtype=torch.double, device=device)
 
     def __getitem__(self, slots: Tensor) -> Tensor:
@@ -127,19 +230,6 @@ class Leaves:
 
     def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
         self._leaves.index_copy_(0, slots, leaf)
-
-
-class SumLeaves(Leaves):
-    """Leaves in place of a tree of sums.
-
-    Examples:
-        >>> tree = SumLeaves(3)
-        >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
-        >>> tree.query(0, 3), tree.scan_lower_bound(torch.tensor([0.5, 1.5], dtype=torch.double))
-        (tensor(3., dtype=torch.float64), tensor([0, 2]))
-    """
-
-    EMPTY = 0.0
 
     def query(self, start: int, end: int) -> Tensor:
         """Return the sum of the leaves from ``start`` to before ``end``, shape ``[]``."""
@@ -153,180 +243,18 @@ class SumLeaves(Leaves):
         return torch.searchsorted(sums, mass.minimum(most), right=True)
 
 
-class MinLeaves(Leaves):
-    """Leaves in place of a tree of minima.
+class MinLeaves(SumLeaves):
+    """Leaves on a GPU in place of TorchRL's tree of minima, with its interface.
 
     Examples:
-        >>> tree = MinLeaves(3)
+        >>> tree = MinLeaves(3, torch.device("cpu"))
         >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
         >>> tree.query(1, 3)
         tensor(2., dtype=torch.float64)
     """
 
-    EMPTY = torch.finfo(torch.double).max
+    EMPTY = _MOST
 
     def query(self, start: int, end: int) -> Tensor:
         """Return the lowest leaf from ``start`` to before ``end``, shape ``[]``."""
         return self._leaves[start:end].amin()
-
-
-def make_trees(capacity: int, device: torch.device) -> tuple[list[Any], Tensor | None]:
-    """Return empty trees of sums, minima and minima, and priorities, NaN, shape ``[N]``.
-
-    The priorities are None where compiled trees have them.
-    """
-    if device.type == "cpu" and find_loops() is not None:
-        # Side by side: two children of a node are one line of the processor's cache.
-        nodes, kinds = _nodes(capacity, 4), enumerate((SumTree, MinTree, MinTree))
-        return [kind(capacity, nodes, n) for n, kind in kinds], None
-    trees: list[Any]
-    if device.type == "cpu":
-        trees = [kind(capacity) for kind in (SumSegmentTreeFp64, *(MinSegmentTreeFp64,) * 2)]
-    else:
-        trees = [kind(capacity, device) for kind in (SumLeaves, MinLeaves, MinLeaves)]
-    return trees, torch.full((capacity,), torch.nan, dtype=torch.double, device=device)
-
-
-def _blocks(capacity: int) -> int:
-    """Return the smallest power of two of blocks of leaves that hold so many slots."""
-    return 1 << ((capacity - 1) // _BLOCK).bit_length()
-
-
-def _nodes(capacity: int, trees: int) -> Tensor:
-    """Return room for trees, NaN: for their nodes down to blocks, then for all leaves."""
-    count = 2 * _blocks(capacity) + -(-capacity // _BLOCK) * _BLOCK
-    return torch.full((count, trees), torch.nan, dtype=torch.double, device="cpu")
-
-
-def empty_tree_like(tree: Any, capacity: int, device: torch.device) -> Any:
-    """Return an empty tree of the same kind, with a leaf for each of ``capacity`` slots."""
-    return type(tree)(capacity, *((device,) if isinstance(tree, Leaves) else ()))
-
-
-def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
-    """Unravel flat slots into TorchRL's index: a tuple for several dimensions, else the slots."""
-    if getattr(storage, "ndim", 1) == 1:
-        return slots
-    return torch.unravel_index(slots, storage.shape)
-
-
-def as_slots(index: Any, storage: Any = None) -> Tensor:
-    """Return flat slots ``[B]`` of slots, of places ``[B, D]``, or of a tuple of ``D`` places."""
-    if isinstance(index, tuple):
-        index = torch.stack([as_integers(places).reshape(-1) for places in index], -1)
-    if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
-        return index.resolve_neg()
-    slots = as_integers(index)
-    if slots.ndim <= 1 or len(slots) == 0:
-        return slots.reshape(-1)
-    # Not the filled part of it: a batch may be from before the storage was emptied.
-    shape = getattr(storage, "_total_shape", None)
-    if shape is None or len(shape) < 2 or len(shape) != slots.shape[-1]:
-        raise RuntimeError(
-            f"index must have one dimension, or one place for each dimension of a storage, got "
-            f"shape {[*slots.shape]} for a storage of shape {None if shape is None else [*shape]}"
-        )
-    places = slots.reshape(-1, len(shape))
-    # TorchRL's writers mark with -1 what was not stored.
-    skipped = (places == -1).all(-1)
-    wrong = ((places < 0) | (places >= places.new_tensor(shape))).any(-1) & ~skipped
-    if bool(wrong.any()):
-        raise IndexError(
-            f"index must be within the storage's shape {[*shape]}, got {places[wrong][0].tolist()}"
-        )
-    slots = places[:, 0]
-    for dimension in range(1, len(shape)):
-        slots = slots * shape[dimension] + places[:, dimension]
-    return torch.where(skipped, -1, slots)
-
-
-def last_of_each(slots: Tensor) -> Tensor | None:
-    """Return the last position of each slot, by slot, shape ``[U]``, or None if order is kept.
-
-    A slot that is written twice keeps its last value, which index writes of many rows do not
-    ensure. On devices other than the CPU the result is the last position of the slot at each
-    position, ``[B]``: the host does not wait for the number of slots.
-    """
-    if not slots.is_cpu:
-        ordered, position = slots.sort(stable=True)
-        return position[torch.searchsorted(ordered, slots, right=True) - 1]
-    count = slots.numel()
-    if count <= _ORDERED:
-        return None
-    # One number for slot and position, as sorting numbers costs half of what unique() does.
-    width = count.bit_length()
-    both = (slots.numpy() << width) + np.arange(count)
-    both.sort()
-    slot = both >> width
-    last = np.append(slot[1:] != slot[:-1], True)
-    return None if last.all() else torch.from_numpy(both[last] & ((1 << width) - 1))
-
-
-def leaves_of(tree: Any, slots: Tensor) -> Tensor:
-    """Return the leaves of slots, shape ``[B]``."""
-    if isinstance(tree, Leaves | CompiledTree):
-        return tree[slots]
-    # Given a tensor, the binding first tries it as a number, and spends ten times as long on the
-    # error as on the leaves. Of an array it reads the memory from the start, without strides.
-    return torch.from_numpy(tree[slots.contiguous().numpy()])
-
-
-def put_leaves(
-    trees: tuple[Any, Any, Any],
-    apart: Tensor | None,
-    slots: Tensor,
-    leaf: Tensor,
-    priority: Tensor,
-    *,
-    learned: bool,
-) -> None:
-    """Write leaves to trees of :func:`make_trees`, and their priorities, each ``[B]``."""
-    if apart is None:
-        trees[0].put(slots, leaf, priority, learned=learned)
-        return
-    apart.index_copy_(0, slots, priority)
-    set_leaves(slots, leaf, *trees[:2])
-    set_leaves(slots, -priority if learned else torch.full_like(priority, torch.inf), trees[2])
-
-
-def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
-    """Write leaves of slots, shape ``[B]``; the last leaf of a repeated slot counts."""
-    takes_tensors = isinstance(trees[0], Leaves | CompiledTree)
-    places = slots if takes_tensors else slots.contiguous().numpy()
-    values = leaf if takes_tensors else leaf.contiguous().numpy()
-    for tree in trees:
-        tree[places] = values
-
-
-class Steps:
-    """Stored transitions by their flat slots, an entry at a time."""
-
-    def __init__(self, storage: Any, slots: Tensor) -> None:
-        self._slots, self._ndim = slots, storage.ndim
-        stored = storage._storage
-        self._stored = stored if is_tensor_collection(stored) else {}
-
-    def get(self, key: Any, default: Any = None) -> Any:
-        """Return an entry of the transitions, shape ``[B, ...]``."""
-        entry = self._stored.get(key, None)
-        if entry is None:
-            return default
-        return entry.flatten(0, self._ndim - 1)[self._slots.to(entry.device)]
-
-
-def random_shares(count: int, *, stratified: bool, **random: Any) -> Tensor:
-    """Sample shares in [0, 1), from all of it or from each of so many equal parts, ``[B]``."""
-    shares = torch.rand(count, dtype=torch.double, **random)
-    if not stratified:
-        return shares
-    # In random order: in a batch sorted by slot, a place would depend on the age.
-    return shares.add_(torch.randperm(count, **random)).div_(count)
-
-
-def slots_at(shares: Tensor, tree: Any, size: int) -> Tensor:
-    """Return the slots at shares of the sum of a tree, which become masses in place, ``[B]``."""
-    if isinstance(tree, SumTree):
-        return tree.slots_at(shares, size)
-    slots: Tensor = tree.scan_lower_bound(shares.mul_(tree.query(0, size)))
-    # Rounding can carry the last bit of mass past the last slot.
-    return slots.clamp_max_(size - 1)

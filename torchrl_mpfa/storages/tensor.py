@@ -24,10 +24,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorStorageCheckpointer
 
 from torchrl_mpfa.checks import check_counts, generator_on
-from torchrl_mpfa.native import find_loops
 from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
-from torchrl_mpfa.storages.rows import rows_at, write_rows
-from torchrl_mpfa.storages.schema import Schema, as_index
+from torchrl_mpfa.storages.plan import RowPlan
+from torchrl_mpfa.storages.schema import as_index
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -59,6 +58,7 @@ class SignalTensorStorage(LazyTensorStorage):
     _rng: torch.Generator | None
     signal_table: SignalTable | None = None
     """Table of the sampler that uses the storage; None before the first use."""
+    _plan: RowPlan | None = None
 
     def __init__(self, max_size: int, **kwargs: Any) -> None:
         max_size = check_counts(max_size=max_size)
@@ -71,22 +71,22 @@ class SignalTensorStorage(LazyTensorStorage):
     def __getstate__(self) -> Any:
         # Another process writes transitions alone.
         mine = get_spawning_popen() is None
-        return {**super().__getstate__(), **({} if mine else {"signal_table": None})}
+        state = {**super().__getstate__(), "_plan": None}
+        return state if mine else {**state, "signal_table": None}
 
-    def _takes(self, slots: Any) -> bool:
-        """Return True if compiled loops may read and write a batch of slots."""
-        return (
-            self.ndim == 1
-            and _is_batch(slots)
-            and len(slots) <= self.max_size
-            and self.initialized
-            and type(self._storage) is TensorDict
-            and find_loops() is not None
-        )
+    def plan(self, slots: Any) -> RowPlan | None:
+        """Return the plan by which rows of slots are read and written; None for what has none."""
+        stored: Any = self._storage if self.initialized else None
+        if type(stored) is not TensorDict or not _is_batch(slots) or len(slots) > self.max_size:
+            return None
+        if self._plan is None or not self._plan.describes(stored):
+            self._plan = RowPlan(stored, self.ndim)
+        return self._plan
 
-    def batch(self, slots: Any, more: Mapping[str, Tensor] | None = None) -> TensorDict | None:
-        """Read transitions, with further entries, by compiled loops; None where PyTorch has to."""
-        return rows_at(self._storage, slots, len(self), more) if self._takes(slots) else None
+    def batch(self, slots: Any, beside: Mapping[str, Tensor] | None = None) -> TensorDict | None:
+        """Read transitions, with entries beside them, by the plan; None where PyTorch has to."""
+        plan = self.plan(slots)
+        return None if plan is None else plan.read(slots, len(self), beside)
 
     def get(self, index: Any) -> Any:
         """Read transitions; all slots come as a tensordict that shares their tensors."""
@@ -104,7 +104,8 @@ class SignalTensorStorage(LazyTensorStorage):
             if set_cursor and type(data) is TensorDict and _is_batch(cursor):
                 if before is not None and self.ndim == data.ndim == 1:
                     self._init(data[0])
-                if self._takes(cursor) and write_rows(self._storage, cursor, data):
+                rows = plan.match(data) if (plan := self.plan(cursor)) else None
+                if rows is not None and rows.write(cursor, self.max_size):
                     self.note_written(cursor)
                     return
             super().set(cursor, data, set_cursor=set_cursor)
@@ -206,7 +207,7 @@ class SignalTensorStorage(LazyTensorStorage):
             if type(stored) is TensorDict and len(stored.keys()):
                 # TorchRL would leave the old values of an entry that is missing.
                 keys = list(stored.keys(True, True))
-                Schema(stored, self.ndim, keys).check(data, self.ndim, whole=True)
+                RowPlan(stored, self.ndim, keys).check(data, self.ndim)
 
     def _settle_loaded(self) -> None:
         where = _common_device(self._storage) if self.initialized else None

@@ -20,9 +20,6 @@ from torchrl_mpfa.fusion import Fusion, ScaledFusion
 from torchrl_mpfa.methods import Prioritized
 from torchrl_mpfa.methods.base import within
 from torchrl_mpfa.samplers.fused import SignalSampler
-from torchrl_mpfa.samplers.trees import set_leaves
-
-_NO_LEAF = float("inf")
 
 
 class MWSampler(SignalSampler):
@@ -73,9 +70,8 @@ class MWSampler(SignalSampler):
     def _follow(self, slots: Tensor, leaf: Tensor) -> None:
         spent = slots[self._spent[slots]]
         if len(spent):
-            set_leaves(spent, leaf.new_zeros(len(spent)), self._sum_tree)
             # Weights are relative to the lowest share of those that can be sampled.
-            set_leaves(spent, leaf.new_full((len(spent),), _NO_LEAF), self._min_tree)
+            self.trees.put(spent, leaf.new_full((len(spent),), -0.0))
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         left = size - int(self._spent[:size].sum())

@@ -11,7 +11,6 @@ import torch
 from tests.mpfa.pairs.parts import BATCH, FUSING, make_rows
 from tests.mpfa.pairs.test_all_pairs import covering
 from tests.mpfa.pairs.twins import AXES, Twins, assert_same, fits, without_c
-from torchrl_mpfa.samplers import trees
 
 _PLAIN = {name: next(iter(values)) for name, values in AXES.items()}
 _MET = ("sampler", "storage", "transform", "form")
@@ -126,10 +125,11 @@ def _check_whole(twins, choice):
     fresh = twins.make()
     fresh.sampler.load_state_dict(buffer.sampler.state_dict())
     slots, size = torch.arange(len(buffer)), len(buffer)
-    for name in ("_sum_tree", "_min_tree"):
-        mine, anew = (getattr(part.sampler, name) for part in (buffer, fresh))
-        assert_same(*(trees.leaves_of(t, slots) for t in (mine, anew)), (name, "leaves"))
-        assert mine.query(0, size) == pytest.approx(anew.query(0, size), rel=1e-12)
+    mine, anew = (part.sampler.trees for part in (buffer, fresh))
+    assert_same(*(trees.leaves(slots) for trees in (mine, anew)), ("trees", "leaves"))
+    for name in ("sum", "lowest"):
+        values = [getattr(trees, name)(size) for trees in (mine, anew)]
+        assert values[0] == pytest.approx(values[1], rel=1e-12)
 
 
 def test_all_that_fuses_is_used_by_threads_and_a_process():

@@ -25,9 +25,8 @@ from tests.mpfa.pairs.parts import (
     make_rows,
 )
 from torchrl_mpfa import SignalReplayBuffer, native
-from torchrl_mpfa.samplers import trees
-from torchrl_mpfa.storages import rows as stored_rows
-from torchrl_mpfa.storages import tensor
+from torchrl_mpfa.samplers import table, trees
+from torchrl_mpfa.storages import plan
 
 AXES = {
     "sampler": SAMPLERS,
@@ -47,7 +46,7 @@ COPIED = ("state_dict", "torch.save", "pickle", "deepcopy")
 @contextmanager
 def without_c():
     """Have parts take PyTorch in place of the compiled loops."""
-    modules = (native, trees, tensor, stored_rows)
+    modules = (native, table, trees, plan)
     before = [module.find_loops for module in modules]
     for module in modules:
         module.find_loops = lambda: None
@@ -210,9 +209,9 @@ class Twins:
             assert_same(*values, (*place, "priority"))
             assert tried.sampler.default_priority == twin.sampler.default_priority, place
             slots = torch.arange(CAPACITY, device="cpu")
-            for tree in ("_sum_tree", "_min_tree", "_max_tree"):
-                leaves = [trees.leaves_of(getattr(b.sampler, tree), slots) for b in (tried, twin)]
-                assert_same(*leaves, (*place, tree, "priority"))
+            kept = [b.sampler.trees for b in (tried, twin)]
+            assert_same(*(t.leaves(slots) for t in kept), (*place, "leaves", "priority"))
+            assert_same(*(t.priorities for t in kept), (*place, "learned", "priority"))
         if hasattr(tried.sampler, "table"):
             assert_same(tried.sampler.table.rows, twin.sampler.table.rows, (*place, "table"))
             assert_same(tried.sampler.weights, twin.sampler.weights, (*place, "weights"))

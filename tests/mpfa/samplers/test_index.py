@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBufferEnsemble
 
 from tests.mpfa.transitions import make_filled, make_transitions, write_signals
-from torchrl_mpfa.samplers.trees import as_slots
+from torchrl_mpfa.samplers.slots import as_slots
 
 NO_INTEGERS = "index must hold integers, got"
 

@@ -34,7 +34,7 @@ def priorities(buffer):
 
 
 def leaves(buffer):
-    return torch.as_tensor(buffer.sampler._sum_tree[torch.arange(len(buffer))])
+    return buffer.sampler.trees.leaves(torch.arange(len(buffer)))
 
 
 def oracle_batch(batch, rewards):

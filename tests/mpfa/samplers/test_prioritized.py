@@ -31,7 +31,7 @@ def filled(sampler, count, capacity):
 
 
 def leaves(sampler, count):
-    return torch.as_tensor(sampler._sum_tree[torch.arange(count)])
+    return sampler.trees.leaves(torch.arange(count))
 
 
 @pytest.mark.parametrize("capacity", [1, 7, 32, 50])
@@ -49,10 +49,10 @@ def test_priorities_are_those_of_torchrl_after_the_same_updates(capacity):
         ours.update_priority(index, priority)
         theirs.update_priority(index, priority)
     slots = torch.arange(capacity)
-    for tree in ("_sum_tree", "_min_tree"):
-        found, expected = (torch.as_tensor(getattr(s, tree)[slots]) for s in (ours, theirs))
-        # TorchRL's trees are in single precision, and of one slot it gives a number.
-        torch.testing.assert_close(found.float().reshape(-1), expected.reshape(-1))
+    found, expected = ours.trees.leaves(slots), torch.as_tensor(theirs._sum_tree[slots])
+    # TorchRL's trees are in single precision, and of one slot it gives a number.
+    torch.testing.assert_close(found.float(), expected.reshape(-1))
+    assert ours.trees.lowest(capacity) == pytest.approx(theirs._min_tree.query(0, capacity))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
@@ -199,8 +199,8 @@ def test_of_a_slot_that_appears_twice_the_last_entry_counts(count):
     for slot, value in zip(slots.tolist(), priority.tolist(), strict=True):
         expected[slot] = value
     assert sampler.priorities().tolist() == expected
-    for tree in (sampler._sum_tree, sampler._min_tree):
-        assert torch.as_tensor(tree[torch.arange(50)]).tolist() == expected
+    assert sampler.trees.leaves(torch.arange(50)).tolist() == expected
+    assert sampler.trees.lowest(50) == min(expected)
 
 
 def test_slot_of_the_highest_priority_is_that_of_torchrl():

@@ -34,7 +34,6 @@ from torchrl_mpfa import (
     make_critic,
     run_updates,
 )
-from torchrl_mpfa.samplers.trees import leaves_of
 from torchrl_mpfa.signals import MPFA_SIGNALS
 
 ENVS, CAPACITY, LENGTH, ALPHA, BETA = 3, 60, 4, 0.6, 0.4
@@ -117,9 +116,9 @@ def slices_by_hand(buffer):
 def check_leaves(buffer):
     expected, slots = slices_by_hand(buffer), torch.arange(CAPACITY)
     leaf = torch.tensor([expected.get(slot, 0.0) ** ALPHA for slot in slots.tolist()]).double()
-    torch.testing.assert_close(leaves_of(buffer.sampler._sum_tree, slots), leaf)
+    torch.testing.assert_close(buffer.sampler.trees.leaves(slots), leaf)
     if expected:
-        lowest = buffer.sampler._min_tree.query(0, CAPACITY)
+        lowest = buffer.sampler.trees.lowest(CAPACITY)
         assert lowest == pytest.approx(float(leaf[leaf > 0].min()))
     return expected
 
@@ -279,7 +278,7 @@ def test_trajectories_are_kept_apart_where_the_next_one_begins_as_the_last_one_e
     steps["collector", "traj_ids"] = torch.tensor([0, 0, 0, 0, 1, 1, 1, 1])
     buffer.extend(steps)
     joined = [True, True, True, False, True, True, True, False]
-    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == joined
+    assert sampler.trees.leaves(torch.arange(8)).gt(0).tolist() == joined
 
 
 def test_rows_of_several_environments_in_turn_are_no_trajectory():
@@ -298,11 +297,11 @@ def test_a_step_in_the_place_of_another_follows_no_older_one_without_observation
     reward = torch.tensor([1.0, 2, 3, 0, 4, 5, 6, 7]).unsqueeze(1)
     after = {"reward": reward, "done": torch.zeros(8, 1, dtype=torch.bool)}
     buffer.extend(TensorDict({"next": after}, [8]))
-    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == [True] * 7 + [False]
+    assert sampler.trees.leaves(torch.arange(8)).gt(0).tolist() == [True] * 7 + [False]
     better = {"reward": torch.full((1, 1), 9.0), "done": torch.zeros(1, 1, dtype=torch.bool)}
     assert buffer.extend(TensorDict({"next": better}, [1])).tolist() == [3]
     joined = [True, True, False, False, True, True, True, False]
-    assert leaves_of(sampler._sum_tree, torch.arange(8)).gt(0).tolist() == joined
+    assert sampler.trees.leaves(torch.arange(8)).gt(0).tolist() == joined
 
 
 def test_a_batch_can_leave_the_ends_as_they_were_stored():

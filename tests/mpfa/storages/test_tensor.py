@@ -23,7 +23,7 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     native,
 )
-from torchrl_mpfa.storages import tensor
+from torchrl_mpfa.storages.plan import NewRows
 
 KINDS = ["memory", "memmap", "memmap_scratch"]
 
@@ -193,7 +193,7 @@ def test_a_first_write_that_fails_leaves_no_form(kind, tmp_path, monkeypatch):
     wrong = TensorDict({"a": torch.zeros(3, 2), "b": torch.zeros(3, 1)}, [3])
     with monkeypatch.context() as patched:
         patched.setattr(TensorDict, "__setitem__", fail_with(RuntimeError("no room")))
-        patched.setattr(tensor, "write_rows", fail_with(RuntimeError("no room")))
+        patched.setattr(NewRows, "write", fail_with(RuntimeError("no room")))
         with pytest.raises(RuntimeError, match="no room"):
             storage.set(torch.arange(3), wrong)
     assert len(storage) == 0 and not storage.initialized
