@@ -365,17 +365,17 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             generator.set_state(numbers)
         self._settle()
         with self._replay_lock, self._write_lock:
-            before = deepcopy(self._transform.state_dict()), self._memory.copies()
-            try:
-                # No step that waits may join those of the state.
-                self._memory.empty()
-                self._transform.load_state_dict(state_dict["_transforms"])
-                self._memory.check_finite()
-                load_part(sampler, state_dict["_sampler"])
-            except BaseException:
-                self._transform.load_state_dict(before[0])
-                self._memory.set_back(before[1])
-                raise
+            with self._memory.kept():
+                before = deepcopy(self._transform.state_dict())
+                try:
+                    # No step that waits may join those of the state.
+                    self._memory.empty()
+                    self._transform.load_state_dict(state_dict["_transforms"])
+                    self._memory.check_finite()
+                    load_part(sampler, state_dict["_sampler"])
+                except BaseException:
+                    self._transform.load_state_dict(before)
+                    raise
             if state_dict.get(_CLOCK) is not self._clock:
                 # States that share the clock are no longer of these data.
                 self._clock[0] = -1
