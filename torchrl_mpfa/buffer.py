@@ -338,8 +338,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 "_batch_size": self._batch_size,
                 "_consume_after_n_samples": self._consume_after_n_samples,
                 "_rng": None if source is None else (source.get_state(), str(source.device)),
-                # The data are not copied: the clock shows that they are no longer those of the
-                # state.
+                # By which the data, no copies, are seen to be no longer those of the state.
                 _CLOCK: self._clock,
                 _TIME: self._clock[0],
             }
