@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import ReplayBuffer, Storage, Transition, Writer
+from torchrl.data import ReplayBuffer, RoundRobinWriter, Storage, Transition, Writer
 from torchrl.data.replay_buffers import PrioritizedSampler, Sampler
 from torchrl.envs.transforms import Transform
 
@@ -22,8 +22,9 @@ from torchrl_mpfa.native import opaque
 from torchrl_mpfa.samplers.composition import distributions
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
-from torchrl_mpfa.saving import check_saved, load_safely, new_dump, open_dump, save_atomically
+from torchrl_mpfa.saving import check_saved, dump, open_dump
 from torchrl_mpfa.storages.schema import as_integers, as_path
+from torchrl_mpfa.storages.states import load_part, state_of
 from torchrl_mpfa.storages.tensor import rows_with
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
 
@@ -33,10 +34,8 @@ _MISSING = (
     "with another loss, or a signal of your own, write batch[{key!r}] = ..., one number per "
     "transition"
 )
-_FILE = "buffer.pt"
-"""File of a dump with the state of all that has no folder."""
-_FOLDERS = ("storage", "sampler", "writer")
-"""Parts that save themselves in folders of a dump."""
+_PARTS = ("storage", "sampler", "writer")
+"""Parts with a state of their own."""
 _CLOCK, _TIME = "_clock", "_time"
 """Entries of a state: the count of writes as it is now, and as it was."""
 _UNRETURNED = 100
@@ -325,10 +324,24 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         As in TorchRL the data are not copied: save or copy the state before more is written, after
         which the state is rejected. Batches that were sampled ahead are forgotten.
         """
+        return self._state(lambda part: part.state_dict())
+
+    def _state(self, state_of: Callable[[Any], Any]) -> dict[str, Any]:
         self._settle()
         with self._replay_lock, self._write_lock:
-            # The data are not copied: the clock shows that they are no longer those of the state.
-            return {**super().state_dict(), _CLOCK: self._clock, _TIME: self._clock[0]}
+            # The properties, not the attributes: with delayed_init the parts are made here.
+            parts = {f"_{name}": state_of(getattr(self, name)) for name in _PARTS}
+            source = self._rng
+            return {
+                **parts,
+                "_transforms": self._transform.state_dict(),
+                "_batch_size": self._batch_size,
+                "_consume_after_n_samples": self._consume_after_n_samples,
+                "_rng": None if source is None else (source.get_state(), str(source.device)),
+                # By which the data, no copies, are seen to be no longer those of the state.
+                _CLOCK: self._clock,
+                _TIME: self._clock[0],
+            }
 
     @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -342,91 +355,80 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             ValueError: If the state of a part does not fit the part; nothing is changed, but if
                 the part is the storage the buffer is empty.
         """
-        check_saved("buffer", state_dict, ("_storage", "_sampler", "_writer"))
+        sampler = self.sampler  # With delayed_init the parts are made here.
+        self._check_state(state_dict)
+        generator = None
+        if state_dict["_rng"] is not None:
+            numbers, device = state_dict["_rng"]
+            generator = torch.Generator(device=device)
+            generator.set_state(numbers)
         self._settle()
-        kind = state_dict["_sampler"].get("_kind")
-        if kind is not None and not hasattr(self.sampler, "KIND"):
+        with self._replay_lock, self._write_lock:
+            with self._memory.kept():
+                before = deepcopy(self._transform.state_dict())
+                try:
+                    # No step that waits may join those of the state.
+                    self._memory.empty()
+                    self._transform.load_state_dict(state_dict["_transforms"])
+                    self._memory.check_finite()
+                    load_part(sampler, state_dict["_sampler"])
+                except BaseException:
+                    self._transform.load_state_dict(before)
+                    raise
+            if state_dict.get(_CLOCK) is not self._clock:
+                # States that share the clock are no longer of these data.
+                self._clock[0] = -1
+                self._clock = [state_dict.get(_TIME, 0)]
+            try:
+                # Last, as it may be too large to be set back.
+                load_part(self._storage, state_dict["_storage"])
+                self._check_loaded()
+                load_part(self._writer, state_dict["_writer"])
+                self._record_cursor()
+            except BaseException:
+                self.empty()
+                raise
+            self._batch_size = state_dict["_batch_size"]
+            self._consume_after_n_samples = state_dict.get("_consume_after_n_samples")
+            if generator is not None:
+                self.set_rng(generator)
+
+    def _check_state(self, state: Any) -> None:
+        """Reject a state that lacks an entry, or is of another sampler, writer or time."""
+        names = *(f"_{name}" for name in _PARTS), "_transforms", "_batch_size", "_rng"
+        check_saved("buffer", state, names)
+        kind = state["_sampler"].get("_kind")
+        if kind is not None and not hasattr(self._sampler, "KIND"):
             # TorchRL's own would leave out what it does not know.
             raise ValueError(
-                f"the saved sampler is {kind!r}, this one a {type(self.sampler).__name__}"
+                f"the saved sampler is {kind!r}, this one a {type(self._sampler).__name__}"
             )
-        if state_dict.get(_CLOCK) not in (None, [state_dict.get(_TIME)]):
+        if state.get(_CLOCK) not in (None, [state.get(_TIME)]):
             raise ValueError(
                 "the buffer was written to since this state of it was made, whose data are the "
                 "buffer's own: save or copy a state before more is written"
             )
-        # A writer of data that no one may write has no cursor, nor has its state.
-        if hasattr(self._writer, "_cursor"):
-            check_saved("writer", state_dict["_writer"], ("_cursor",))
-            check(COUNT_OR_ZERO, cursor=(cursor := state_dict["_writer"]["_cursor"]))
+        # Other writers have no cursor, nor has their state.
+        if isinstance(self._writer, RoundRobinWriter):
+            check_saved("writer", state["_writer"], ("_cursor",))
+            check(COUNT_OR_ZERO, cursor=(cursor := state["_writer"]["_cursor"]))
             if self._storage.ndim == 1 and cursor >= self._storage.max_size:
                 raise ValueError(
                     f"cursor of the saved writer must be below {self._storage.max_size}, got "
                     f"{cursor}"
                 )
-        self._load(state_dict, lambda name, part: part.load_state_dict(state_dict[f"_{name}"]))
-
-    def _load(self, state: dict[str, Any], load: Callable[[str, Any], None]) -> None:
-        """Load all parts, the storage once the others have been found to fit."""
-        check_saved("buffer", state, ("_transforms", "_batch_size", "_rng"))
         if state["_batch_size"] is not None:
             check_counts(batch_size=state["_batch_size"])
-        generator = None
-        if state["_rng"] is not None:
-            numbers, device = state["_rng"]
-            generator = torch.Generator(device=device)
-            generator.set_state(numbers)
-        sampler = self.sampler  # With delayed_init the parts are made here.
-        self._settle()
-        with self._replay_lock, self._write_lock:
-            before = deepcopy(self._transform.state_dict()), self._memory.copies()
-            try:
-                # No step that waits may join those of the state.
-                self._memory.empty()
-                self._transform.load_state_dict(state["_transforms"])
-                self._memory.check_finite()
-                load("sampler", sampler)
-            except BaseException:
-                self._transform.load_state_dict(before[0])
-                self._memory.set_back(before[1])
-                raise
-            if state.get(_CLOCK) is not self._clock:
-                # States that share the clock are no longer of these data.
-                self._clock[0] = -1
-                self._clock = [state.get(_TIME, 0)]
-            try:
-                load("storage", self._storage)
-                self._check_loaded()
-                load("writer", self._writer)
-                self._record_cursor()
-            except BaseException:
-                self.empty()
-                raise
-            self._batch_size = state["_batch_size"]
-            self._consume_after_n_samples = state.get("_consume_after_n_samples")
-            if generator is not None:
-                self.set_rng(generator)
 
     def dumps(self, path: str | Path) -> None:
-        """Save in a folder, whole or not at all, with a checksum of each file.
+        """Save the state in a folder, whole or not at all, with a checksum.
 
         Raises:
-            ValueError: If the data hold anything but tensors and plain values.
+            pickle.UnpicklingError: If the data hold anything but tensors and plain values; nothing
+                is written.
         """
-        self._settle()
-        with new_dump(path) as folder, self._replay_lock, self._write_lock:
-            for name in _FOLDERS:
-                getattr(self, name).dumps(folder / name)
-            source = self._rng
-            state = {
-                "_transforms": self._transform.state_dict(),
-                _TIME: self._clock[0],
-                "_batch_size": self._batch_size,
-                "_consume_after_n_samples": self._consume_after_n_samples,
-                "_rng": None if source is None else (source.get_state(), str(source.device)),
-            }
-            save_atomically(state, folder / _FILE)
-            load_safely(folder / _FILE)
+        with self._replay_lock, self._write_lock:
+            dump(self._state(state_of), path)
 
     @torch.inference_mode(False)
     def loads(self, path: str | Path) -> None:
@@ -435,9 +437,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         Raises:
             FileNotFoundError: If there is no such folder.
             KeyError: As :meth:`load_state_dict`.
-            ValueError: As :meth:`load_state_dict`; or if a file is damaged, missing, or could
-                execute something; nothing is changed.
+            ValueError: As :meth:`load_state_dict`; or if the file is damaged; nothing is changed.
         """
-        folder = open_dump(path)
-        state = load_safely(folder / _FILE)
-        self._load(state, lambda name, part: part.loads(folder / name))
+        self.load_state_dict(open_dump(path))

@@ -1,4 +1,4 @@
-"""Saved states: files and folders that are whole or absent, and checks of their entries.
+"""Saved states: files that are whole or absent, and checks of their entries.
 
 Files hold tensors and plain values only, so that reading one executes nothing, and a checksum, so
 that damage is noticed.
@@ -6,15 +6,12 @@ that damage is noticed.
 
 from __future__ import annotations
 
-import fcntl
 import glob
-import json
+import io
 import math
 import os
 import pickle
-import re
 import secrets
-import shutil
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,14 +20,10 @@ from typing import IO, Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
-MANIFEST = "manifest.json"
-_FORMAT = 2
-_LOCK = ".lock"
-_ENDINGS = {".json", ".memmap", ".pt"}
-"""Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
-_EVALUATED = "data_indices.json"
-"""File by whose presence TorchRL's storage executes text of its ``metadata.json``."""
+_STATE = "state.pt"
+"""File of a dump."""
 _NO_COMMENT = bytes(2)
 """The last bytes of an archive without a comment: the length of that comment."""
 _MARK = b"crc32:"
@@ -103,6 +96,19 @@ def load_safely(
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
+def allocate(path: str | Path, size: int = 0) -> None:
+    """Reserve room on the disk for a file that is mapped to memory, or raise ``OSError``.
+
+    A write to a mapped file for which the disk has no room would kill the process.
+    """
+    with open(path, "r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size or os.path.getsize(path) or 1)
+        except OSError as error:
+            error.filename = str(path)
+            raise
+
+
 def check_saved(part: str, state: Any, names: Iterable[str] = (), /, **exact: Any) -> None:
     """Reject a part's saved state that lacks one of the names, or has another value of ``exact``.
 
@@ -142,92 +148,34 @@ def check_saved_numbers(part: str, state: Any) -> None:
             raise ValueError(f"the saved {part} must be finite, got {value} in {name!r}")
 
 
-@contextmanager
-def new_dump(path: str | Path) -> Iterator[Path]:
-    """A new folder inside ``path`` that counts once it is whole, and then replaces the one before.
+def dump(state: Any, path: str | Path) -> None:
+    """Save a state in a folder, as :func:`save_atomically` does.
 
-    ``path/manifest.json`` names the folder that counts and is replaced in one step: a crash at any
-    moment leaves the old dump or the new one. The next dump removes what a killed one left. Of
-    several at once, by threads or processes, each waits for the one before.
+    Args:
+        state: Tensors and plain values.
+        path: The folder, which is made if its parent is there.
+
+    Raises:
+        pickle.UnpicklingError: If the state holds anything else; nothing is written.
     """
-    path = Path(path).absolute()
-    path.mkdir(exist_ok=True)
-    with (path / _LOCK).open("ab") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        numbers = [int(dump.name[5:]) for dump in _versions(path)]
-        folder = path / f"dump-{max(numbers, default=0) + 1}"
-        folder.mkdir()
-        try:
-            yield folder
-            seal_dump(path, folder)
-        except BaseException:
-            shutil.rmtree(folder)
-            raise
-        for old in _versions(path):
-            if old != folder:
-                shutil.rmtree(old, ignore_errors=True)
+    plan = io.BytesIO()
+    torch.save(tree_map_only(Tensor, lambda tensor: tensor.new_empty(0), state), plan)
+    plan.seek(0)
+    torch.load(plan, weights_only=True)
+    Path(path).mkdir(exist_ok=True)
+    save_atomically(state, Path(path) / _STATE)
 
 
-def seal_dump(path: Path, folder: Path) -> None:
-    """Write size and checksum of every file in ``folder`` to ``path/manifest.json``."""
-    files = {name: _measure(folder / name) for name in _files(folder)}
-    manifest = {"format": _FORMAT, "folder": os.path.relpath(folder, path), "files": files}
-    write_text_atomically(json.dumps(manifest, indent=1) + "\n", path / MANIFEST)
+def open_dump(path: str | Path) -> Any:
+    """Read a state from a folder as :func:`load_safely` does, its tensors left in the file.
 
-
-def open_dump(path: str | Path) -> Path:
-    """Compare every file of a dump with its checksum, and return the folder of the files."""
-    path = Path(path).absolute()
-    if not path.is_dir():
-        raise FileNotFoundError(f"no such folder: {path}")
-    if not (path / MANIFEST).is_file() or (path / MANIFEST).is_symlink():
-        raise ValueError(f"{path} is not a complete dump of this package: it has no {MANIFEST}")
-    try:
-        manifest: dict[str, Any] = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        name, files, version = manifest["folder"], dict(manifest["files"]), manifest["format"]
-        is_ours = re.fullmatch(r"dump-\d+", name) and not (path / name).is_symlink()
-        if name != "." and not is_ours:
-            raise ValueError(f"it names the folder {name!r}, which is not the dump's own")
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path / MANIFEST} is damaged: {error}") from error
-    if version != _FORMAT:
-        raise ValueError(f"format of {path / MANIFEST} is {version}, this version reads {_FORMAT}")
-    folder = path / name
-    present = _files(folder)
-    for file in sorted({*present} ^ {*files}):
-        word = "missing" if file in files else "not part of the dump"
-        raise ValueError(f"{folder / file} is {word}")
-    for file in present:
-        if _measure(folder / file) != files[file]:
-            raise ValueError(f"{folder / file} is damaged: its size or checksum is wrong")
-    return folder
-
-
-def _versions(path: Path) -> list[Path]:
-    return [folder for folder in path.glob("dump-*") if re.fullmatch(r"dump-\d+", folder.name)]
-
-
-def _files(folder: Path) -> list[str]:
-    """Names of all files under a folder, but for its own manifest, none of which may execute."""
-    files = [file for file in folder.rglob("*") if file != folder / MANIFEST]
-    for file in files:
-        if file.is_symlink() or not (file.is_dir() or file.is_file()):
-            raise ValueError(f"{file} is a link or a device: dumps hold files and folders only")
-        name = file.name.lower()
-        if file.is_file() and (file.suffix.lower() not in _ENDINGS or name == _EVALUATED):
-            raise ValueError(
-                f"{file} could execute anything when it is read: dumps hold tensors and plain "
-                "values only"
-            )
-    return sorted(file.relative_to(folder).as_posix() for file in files if file.is_file())
-
-
-def _measure(file: Path) -> list[int]:
-    """Size in bytes and CRC-32 of a file, which is on the disk afterwards."""
-    with file.open("rb") as opened:
-        os.fsync(opened.fileno())
-        size = opened.seek(0, os.SEEK_END)
-        return [size, checksum_of(opened, size)]
+    Raises:
+        FileNotFoundError: If there is no such folder, or no state in it.
+    """
+    file = Path(path) / _STATE
+    if not file.is_file():
+        raise FileNotFoundError(f"{path} must be a folder of dumps(...), got none with {_STATE}")
+    return load_safely(file, mmap=True)
 
 
 def _seal(file: IO[bytes]) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
+from types import MappingProxyType
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 from torchrl.envs.transforms import Compose, MultiStepTransform, Transform
 
 from torchrl_mpfa.checks import as_mask
@@ -45,16 +47,28 @@ class TransformMemory:
         writing = [transform for transform in self._transform if _writes(transform)]
         return [module for transform in writing for module in transform.modules()]
 
-    def copies(self) -> dict[nn.Module, _Attributes]:
-        """Return copies of all attributes by module."""
-        return {part: _copied(_attributes(part)) for part in self.parts()}
+    @contextmanager
+    def kept(self) -> Iterator[dict[nn.Module, _Attributes]]:
+        """Set attributes and random numbers back if anything raises inside of this.
+
+        Yields:
+            By module, copies of its attributes.
+        """
+        copies = {part: _copied(_attributes(part)) for part in self.parts()}
+        values = [value for attributes in copies.values() for value in attributes.values()]
+        sources = [torch.default_generator, *values]
+        states = [(s, s.get_state()) for s in sources if isinstance(s, torch.Generator)]
+        try:
+            yield copies
+        except BaseException:
+            _set_back(copies)
+            for source, state in states:
+                source.set_state(state)
+            raise
 
     @contextmanager
     def transformed(self, data: TensorDictBase) -> Iterator[TensorDictBase | None]:
-        """Yield transitions as the transforms make them.
-
-        Attributes and random numbers are set back if anything raises inside of this.
-        """
+        """Yield transitions as the transforms make them; see :meth:`kept`."""
         parts = self.parts()
         if not parts:
             yield self._transform.inv(data)
@@ -63,45 +77,35 @@ class TransformMemory:
             if part not in self._first:
                 _warn_of_steps_past_the_end(part)
                 self._first[part] = {}
-        before = {part: _attributes(part) for part in parts}
-        copies, random = self.copies(), torch.get_rng_state()
-        sources = [v for values in before.values() for v in values.values()]
-        sources = [source for source in sources if isinstance(source, torch.Generator)]
-        states = [source.get_state() for source in sources]
-        try:
+        with self.kept() as copies:
             # A copy: the caller may write into its own again.
             rows = self._transform.inv(_with_masks(data.clone(), parts))
-            self.check_finite(value for _, _, value in _changes(before))
+            self.check_finite(copies)
             yield rows
-        except BaseException:
-            self.set_back(copies)
-            torch.set_rng_state(random)
-            for source, state in zip(sources, states, strict=True):
-                source.set_state(state)
-            raise
-        for part, name, _ in _changes(before):
+        for part, name, _ in self._changes(copies):
             self._first[part].setdefault(name, copies[part].get(name))
 
-    def check_finite(self, values: Iterable[Any] | None = None) -> None:
-        """Reject a number that is not finite in the steps that wait in these, by default all."""
-        if values is None:
-            values = (value for part in self.parts() for value in _attributes(part).values())
-        for value in values:
-            for waiting in _rows(value):
-                check_finite_entries(waiting, waiting.ndim, self._allowed)
+    def check_finite(self, since: Mapping[nn.Module, _Attributes] = MappingProxyType({})) -> None:
+        """Reject a number that is not finite in the steps that wait, or do so since a copy."""
+        for _, _, value in self._changes(since):
+            for waiting in tree_leaves(value, lambda v: isinstance(v, TensorDictBase)):
+                if isinstance(waiting, TensorDictBase):
+                    check_finite_entries(waiting, waiting.ndim, self._allowed)
 
-    def set_back(self, copies: dict[nn.Module, _Attributes]) -> None:
-        """Give modules the attributes that they had when these were copied."""
-        for part, attributes in copies.items():
-            for name in _attributes(part).keys() - attributes.keys():
-                delattr(part, name)
-            for name, value in attributes.items():
-                (part._buffers if name in part._buffers else vars(part))[name] = value
+    def _changes(
+        self, since: Mapping[nn.Module, _Attributes]
+    ) -> Iterator[tuple[nn.Module, str, Any]]:
+        """Yield what has changed, or may have in its place: module, name and value."""
+        for part in self.parts():
+            before = since.get(part, {})
+            for name, value in _attributes(part).items():
+                if name not in before or value is not before[name]:
+                    yield part, name, value
 
     def empty(self) -> None:
         """Give attributes the values that they had before any write."""
         first = self._first.items()
-        self.set_back({part: _attributes(part) | _copied(values) for part, values in first})
+        _set_back({part: _attributes(part) | _copied(values) for part, values in first})
 
 
 def _warn_of_steps_past_the_end(part: nn.Module) -> None:
@@ -142,35 +146,21 @@ def _attributes(part: nn.Module) -> _Attributes:
     return {**attributes, **part._buffers}
 
 
-def _changes(before: dict[nn.Module, _Attributes]) -> Iterator[tuple[nn.Module, str, Any]]:
-    """Yield what a write has changed, or may have changed in its place: module, name and value."""
-    for part, attributes in before.items():
-        for name, value in _attributes(part).items():
-            if value is not attributes.get(name) or _is_written_in(value):
-                yield part, name, value
-
-
-def _is_written_in(value: Any) -> bool:
-    """Return True if a write may change a value in its place."""
-    return isinstance(value, Tensor | TensorDictBase | list | deque | dict)
+def _set_back(copies: dict[nn.Module, _Attributes]) -> None:
+    """Give modules the attributes that they had when these were copied."""
+    for part, attributes in copies.items():
+        for name in _attributes(part).keys() - attributes.keys():
+            delattr(part, name)
+        for name, value in attributes.items():
+            (part._buffers if name in part._buffers else vars(part))[name] = value
 
 
 def _copied(attributes: _Attributes) -> _Attributes:
     """Return attributes with copies of what a write may change in its place."""
-    return {
-        name: value.clone()
-        if isinstance(value, Tensor | TensorDictBase)
-        else copy(value)
-        if _is_written_in(value)
-        else value
-        for name, value in attributes.items()
-    }
-
-
-def _rows(value: Any) -> Iterator[TensorDictBase]:
-    """Yield the tensordicts in a value."""
-    if isinstance(value, TensorDictBase):
-        yield value
-    elif isinstance(value, list | tuple | deque | dict):
-        for entry in value.values() if isinstance(value, dict) else value:
-            yield from _rows(entry)
+    copies = dict(attributes)
+    for name, value in attributes.items():
+        if isinstance(value, Tensor | TensorDictBase):
+            copies[name] = value.clone()
+        elif isinstance(value, list | deque | dict):
+            copies[name] = copy(value)
+    return copies

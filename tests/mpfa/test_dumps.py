@@ -7,18 +7,36 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
-import zlib
 from pathlib import Path
 
 import pytest
-from torchrl.data import CompressedListStorage, LazyTensorStorage
+import torch
+from torchrl.data import (
+    CompressedListStorage,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    TensorDictMaxValueWriter,
+    TensorDictReplayBuffer,
+)
 from torchrl.data.replay_buffers import RandomSampler
+from torchrl.envs.transforms import Transform
 
-from tests.mpfa.transitions import Trap, make_buffer, make_transitions, rejected, train_rounds
-from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.saving import MANIFEST, new_dump, open_dump
+from tests.mpfa.transitions import (
+    Trap,
+    make_buffer,
+    make_transitions,
+    rejected,
+    same,
+    train_rounds,
+)
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+)
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 
 @pytest.fixture
@@ -38,78 +56,122 @@ def check_rejected(folder, match):
         buffer.loads(folder)
 
 
-def sealed_by_hand(path, folder):
-    """The manifest of whatever is there, links to folders left out."""
-    found = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != MANIFEST)
-    files = {
-        file.relative_to(folder).as_posix(): [file.stat().st_size, zlib.crc32(file.read_bytes())]
-        for file in found
-    }
-    manifest = {"format": 2, "folder": os.path.relpath(folder, path), "files": files}
-    (path / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+def with_files(dumped, **files):
+    """Put files in the place of the state of the storage of a dump, as an attacker could."""
+    path = dumped / "state.pt"
+    content = {name: torch.tensor([*text], dtype=torch.uint8) for name, text in files.items()}
+    save_atomically({**load_safely(path), "_storage": {"_files": content}}, path)
 
 
-@pytest.mark.parametrize("indices", [True, False])
-def test_text_that_torchrl_would_evaluate_is_never_read(tmp_path, indices):
+def test_text_that_torchrl_would_evaluate_is_never_read(dumped, tmp_path):
     trap = tmp_path / "trap"
-
-    def make(kind):
-        return SignalReplayBuffer(storage=kind(max_size=16), sampler=RandomSampler(), batch_size=2)
-
-    buffer = make(LazyTensorStorage)
-    buffer.extend(make_transitions(4))
-    buffer.dumps(tmp_path / "buffer")
-    folder = tmp_path / "buffer/dump-1"
     code = {"__type__": "torch.dtype", "value": f"__import__('os').mkdir({str(trap)!r})"}
-    (folder / "storage/metadata.json").write_text(json.dumps([code]), encoding="utf-8")
-    if indices:
-        (folder / "storage/data_indices.json").write_text("[0]", encoding="utf-8")
-    sealed_by_hand(tmp_path / "buffer", folder)
-    with pytest.raises((ValueError, FileNotFoundError), match=r"data_indices\.json|Data indices"):
-        make(CompressedListStorage).loads(tmp_path / "buffer")
+    files = {"metadata.json": json.dumps([code]).encode(), "data_indices.json": b"[0]"}
+    with_files(dumped, **files)
+    buffer = SignalReplayBuffer(storage=CompressedListStorage(16), sampler=RandomSampler())
+    buffer.set_sampler(make_buffer(16).sampler)
+    with pytest.raises(ValueError, match=r"data_indices\.json could execute anything"):
+        buffer.loads(dumped)
     assert not trap.exists()
 
 
-def replace_by_link(path):
-    path.rename(path.with_name("moved"))
-    path.symlink_to("moved")
+@pytest.mark.parametrize("name", ["prefetch.pkl", "next/other.pickle", "0", "meta.json/x.PKL"])
+def test_file_that_would_be_unpickled_is_never_read(dumped, tmp_path, name):
+    trap = tmp_path / "trap"
+    with_files(dumped, **{name: pickle.dumps(Trap(trap))})
+    with pytest.raises(ValueError, match=rf"{name} could execute anything when it is read"):
+        make_buffer(16).loads(dumped)
+    assert not trap.exists()
 
 
-@pytest.mark.parametrize(
-    ("place", "spoil", "words"),
-    [
-        ("dump-1/storage/observation.memmap", replace_by_link, "observation.memmap is a link"),
-        ("dump-1/storage", replace_by_link, "dump-1/storage is a link"),
-        ("dump-1/storage/none", lambda path: path.symlink_to("nothing"), "storage/none is a link"),
-        ("dump-1/storage/pipe", os.mkfifo, "storage/pipe is a link or a device"),
-        ("dump-1", replace_by_link, "it names the folder 'dump-1', which is not the dump's own"),
-        (MANIFEST, replace_by_link, f"it has no {MANIFEST}"),
-    ],
-)
-def test_link_or_pipe_in_a_folder_is_rejected(dumped, place, spoil, words):
-    spoil(dumped / place)
-    check_rejected(dumped, words)
+@pytest.mark.parametrize("name", ["../x.json", "/tmp/x.json", "a/../../x.json"])
+def test_file_outside_of_its_folder_is_never_written(dumped, name):
+    with_files(dumped, **{name: b"{}"})
+    with pytest.raises(ValueError, match="files of a part must lie in its folder, got"):
+        make_buffer(16).loads(dumped)
 
 
 def test_folder_is_loaded_through_a_link_to_it(dumped, tmp_path):
     (tmp_path / "latest").symlink_to(dumped)
     make_buffer(16).loads(tmp_path / "latest")
-    make_buffer(16).storage.loads(tmp_path / "latest/dump-1/storage")
 
 
-@pytest.mark.parametrize("place", [".", "dump-1", "dump-1/storage"])
-@pytest.mark.parametrize("name", ["prefetch.pkl", "other.pickle", "0"])
-@pytest.mark.parametrize("sealed", [False, True])
-def test_file_that_would_be_unpickled_is_never_read(dumped, tmp_path, place, name, sealed):
-    trap = tmp_path / "trap"
-    (dumped / place / name).write_bytes(pickle.dumps(Trap(trap)))
-    if sealed and place != ".":
-        sealed_by_hand(dumped, dumped / "dump-1")
-    if place == ".":
-        make_buffer(16).loads(dumped)
-    else:
-        check_rejected(dumped, rf"{name} could execute anything when it is read")
-    assert not trap.exists()
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_parts_of_a_buffer_of_torchrl_s_save_themselves(tmp_path, kind):
+    def make():
+        storage, sampler = kind(16), MPFASampler(16)
+        return TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=4)
+
+    first, second = make(), make()
+    first.extend(make_transitions(12))
+    first.dumps(tmp_path / "buffer")
+    for part in ("storage", "sampler"):
+        assert [file.name for file in (tmp_path / "buffer" / part).iterdir()] == ["state.pt"]
+    second.loads(tmp_path / "buffer")
+    assert same(first[:].to_dict(), second[:].to_dict())
+    assert same(first.sampler.state_dict(), second.sampler.state_dict())
+
+
+def test_writer_of_the_highest_values_is_restored(tmp_path):
+    first, second = (SignalReplayBuffer(storage=SignalTensorStorage(4)) for _ in range(2))
+    for buffer in (first, second):
+        # TorchRL's makes a list of a nested key when it is loaded.
+        buffer.set_writer(TensorDictMaxValueWriter(rank_key="observation"))
+    first.extend(make_transitions(8))
+    first.dumps(tmp_path / "buffer")
+    second.loads(tmp_path / "buffer")
+    for buffer in (first, second):
+        buffer.extend(make_transitions(4, first=2, seed=1))
+        buffer.extend(make_transitions(2, first=6, seed=2))
+    assert same(first[:].to_dict(), second[:].to_dict())
+
+
+@pytest.mark.parametrize("kind", [LazyMemmapStorage, SignalMemmapStorage])
+def test_rows_are_mapped_in_the_folder_of_the_storage_that_loads_them(dumped, tmp_path, kind):
+    buffer = make_buffer(16, storage=kind(16, scratch_dir=tmp_path / "rows"))
+    buffer.loads(dumped)
+    assert (tmp_path / "rows/observation.memmap").exists()
+    assert buffer[:]["observation"].flatten().tolist() == list(range(12))
+
+
+@pytest.mark.parametrize("kind", [LazyTensorStorage, SignalTensorStorage, SignalMemmapStorage])
+def test_names_with_dots_and_entries_without_numbers_are_restored(tmp_path, kind):
+    def make(name):
+        mapped = {"scratch_dir": tmp_path / name} if kind is SignalMemmapStorage else {}
+        return make_buffer(8, storage=kind(8, **mapped))
+
+    rows = make_transitions(4)
+    rows["a.b"], rows["c", "d.e"], rows["none"] = torch.ones(4), torch.ones(4, 2), torch.ones(4, 0)
+    first, second = make("first"), make("second")
+    first.extend(rows)
+    first.dumps(tmp_path / "buffer")
+    second.loads(tmp_path / "buffer")
+    assert same(first[:].to_dict(), second[:].to_dict())
+
+
+def test_texts_are_rejected_at_the_save(tmp_path):
+    buffer = make_buffer(8)
+    rows = make_transitions(2)
+    rows["task"] = ["one", "two"]
+    buffer.extend(rows)
+    with pytest.raises(ValueError, match=r"must be tensors to be saved, got .* at 'task'"):
+        buffer.dumps(tmp_path / "buffer")
+
+
+def test_what_could_not_be_read_again_is_rejected_before_anything_is_written(dumped):
+    class Odd(Transform):
+        def get_extra_state(self):
+            return Trap("nowhere")
+
+        def set_extra_state(self, state):
+            pass
+
+    buffer = make_buffer(16, transform=Odd())
+    before = (dumped / "state.pt").read_bytes()
+    with pytest.raises(pickle.UnpicklingError, match="Weights only load failed"):
+        buffer.dumps(dumped)
+    assert os.listdir(dumped) == ["state.pt"]
+    assert (dumped / "state.pt").read_bytes() == before
 
 
 def test_folder_of_torchrl_is_rejected_and_not_unpickled(tmp_path):
@@ -117,97 +179,52 @@ def test_folder_of_torchrl_is_rejected_and_not_unpickled(tmp_path):
     (tmp_path / "buffer").mkdir()
     (tmp_path / "buffer/prefetch.pkl").write_bytes(pickle.dumps(Trap(trap)))
     for buffer in (make_buffer(16), SignalReplayBuffer(storage=SignalTensorStorage(4))):
-        with pytest.raises(
-            ValueError, match=r"buffer is not a complete dump .*: it has no manifest"
-        ):
-            buffer.loads(tmp_path / "buffer")
+        for folder in ("buffer", "none"):
+            with pytest.raises(FileNotFoundError, match=f"{folder} must be a folder of dumps"):
+                buffer.loads(tmp_path / folder)
     assert not trap.exists()
 
 
-def files_of(folder):
-    beside = (MANIFEST, ".lock")
-    return sorted(file for file in folder.rglob("*") if file.is_file() and file.name not in beside)
-
-
-def test_flipped_bit_of_a_folder_is_noticed(dumped):
-    chance = random.Random(0)
+def test_flipped_bit_or_short_file_of_a_folder_is_noticed(dumped):
+    chance, file = random.Random(0), dumped / "state.pt"
+    whole = file.read_bytes()
     for _ in range(60):
-        file = chance.choice([*files_of(dumped), dumped / MANIFEST])
-        whole = file.read_bytes()
         damaged = bytearray(whole)
         bit = chance.randrange(len(whole) * 8)
         damaged[bit // 8] ^= 1 << bit % 8
         file.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"is damaged|is missing|is not part|format of"):
-            open_dump(dumped)
-        file.write_bytes(whole)
+        check_rejected(dumped, r"is damaged|is cut short")
+    file.write_bytes(whole[:-1])
+    check_rejected(dumped, r"state\.pt is cut short")
+    file.write_bytes(whole)
     make_buffer(16).loads(dumped)
-
-
-def test_missing_short_or_unknown_file_of_a_folder_is_rejected_by_name(dumped):
-    for file in files_of(dumped):
-        whole = file.read_bytes()
-        file.write_bytes(whole[:-1])
-        with pytest.raises(ValueError, match=f"{file.name} is damaged: its size or checksum is"):
-            open_dump(dumped)
-        file.unlink()
-        with pytest.raises(ValueError, match=f"{file.name} is missing"):
-            open_dump(dumped)
-        file.write_bytes(whole)
-    (dumped / "dump-1/storage/more.memmap").write_bytes(b"1")
-    check_rejected(dumped, "more.memmap is not part of the dump")
-
-
-def test_manifest_that_names_a_folder_outside_is_rejected(dumped):
-    text = (dumped / MANIFEST).read_text(encoding="utf-8")
-    (dumped / MANIFEST).write_text(text.replace('"dump-1"', '"../dump-1"'), encoding="utf-8")
-    check_rejected(dumped, "manifest.json is damaged: it names the folder '../dump-1'")
-    with pytest.raises(FileNotFoundError, match=r"no such folder: .*none"):
-        make_buffer(16).loads(dumped / "none")
 
 
 def test_failed_dump_leaves_the_old_folder_alone(dumped, monkeypatch):
     buffer = make_buffer(16)
     buffer.extend(make_transitions(5))
 
-    def crash(_):
+    def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(buffer.writer, "dumps", crash)
+    monkeypatch.setattr(os, "replace", crash)
     with pytest.raises(KeyboardInterrupt):
         buffer.dumps(dumped)
-    assert sorted(os.listdir(dumped)) == [".lock", "dump-1", MANIFEST]
+    assert os.listdir(dumped) == ["state.pt"]
     found = make_buffer(16)
     found.loads(dumped)
     assert len(found) == 12
 
 
-def test_dump_removes_the_old_folder_and_leftovers(dumped):
-    (dumped / "dump-7").mkdir()
+def test_dump_replaces_the_state_and_leaves_all_else(dumped):
     (dumped / "notes.txt").write_text("mine")
     buffer = make_buffer(16)
     buffer.extend(make_transitions(5))
     buffer.dumps(dumped)
-    assert sorted(os.listdir(dumped)) == [".lock", "dump-8", MANIFEST, "notes.txt"]
+    assert sorted(os.listdir(dumped)) == ["notes.txt", "state.pt"]
     found = make_buffer(16)
     found.loads(dumped)
     assert len(found) == 5
-
-
-def test_concurrent_dumps_wait_for_each_other(dumped):
-    later = make_buffer(16)
-    later.extend(make_transitions(3))
-    thread = threading.Thread(target=later.dumps, args=[dumped])
-    with new_dump(dumped) as folder:
-        thread.start()
-        thread.join(0.2)
-        assert thread.is_alive()
-        assert sorted(os.listdir(dumped)) == [".lock", "dump-1", folder.name, MANIFEST]
-    thread.join()
-    assert sorted(os.listdir(dumped)) == [".lock", "dump-3", MANIFEST]
-    found = make_buffer(16)
-    found.loads(dumped)
-    assert len(found) == 3
 
 
 DUMPING = """

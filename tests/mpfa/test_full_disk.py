@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import MemoryMappedTensor
+from torchrl.data import FlatStorageCheckpointer
 
 from tests.mpfa.transitions import make_buffer, make_filled, make_transitions
 from torchrl_mpfa import SignalMemmapStorage
@@ -107,14 +108,22 @@ def test_signals_without_room_name_their_file(tmp_path, monkeypatch):
         SignalMemmapStorage(100, scratch_dir=tmp_path)
 
 
-def test_dump_without_room_leaves_the_dump_before(tmp_path, monkeypatch):
+def test_dump_without_room_leaves_the_dump_before(tmp_path, request):
     buffer, fresh = make_filled(), make_buffer()
     buffer.dumps(tmp_path)
     buffer.extend(make_transitions(4, first=50))
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "posix_fallocate", no_space)
-        with pytest.raises(OSError, match="No space left on device"):
-            buffer.dumps(tmp_path)
-    assert len(list(tmp_path.glob("dump-*"))) == 1
+    request.getfixturevalue("no_room")
+    with pytest.raises(OSError, match="No space left on device"):
+        buffer.dumps(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
     fresh.loads(tmp_path)
     assert fresh[:]["observation"].flatten().tolist() == list(range(16))
+
+
+def test_checkpointer_without_room_raises_and_is_not_killed(tmp_path, monkeypatch):
+    buffer = make_filled()
+    buffer.storage.checkpointer = FlatStorageCheckpointer()
+    monkeypatch.setattr(os, "posix_fallocate", no_space)
+    with pytest.raises(OSError, match="No space left on device"):
+        buffer.dumps(tmp_path / "dump")
+    assert not (tmp_path / "dump").exists()

@@ -88,6 +88,9 @@ BUFFER = {
 }
 STORAGE = {
     "_attached_entities_iter": lambda b: [*b._storage._attached_entities_iter()] == [b],
+    "_default_checkpointer": lambda b: (
+        type(b._storage.checkpointer) is b._storage._default_checkpointer
+    ),
     "_bump_mutation_revision": lambda b: takes(b._storage._bump_mutation_revision),
     "_len": lambda b: b._storage._len == 5,
     "_len_along_dim0": lambda b: b._storage._len_along_dim0 == 5,
@@ -121,6 +124,7 @@ REST = {
     "_filename": lambda b: mapped()._filename is None or Path(mapped()._filename).exists(),
     "_handler": lambda b: mapped()._handler is None or isinstance(mapped()._handler.fd, int),
     "_load_hooks": lambda b: not TensorStorageCheckpointer()._load_hooks,
+    "_save_hooks": lambda b: not TensorStorageCheckpointer()._save_hooks,
     "_new_unsafe": lambda b: (
         TensorDict._new_unsafe({"x": torch.ones(2)}, batch_size=torch.Size([2]), device=None).shape
         == (2,)

@@ -22,7 +22,7 @@ from tests.mpfa.transitions import (
     train_rounds,
 )
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.saving import load_safely, save_atomically, seal_dump
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 CAPACITY = 24
 UNALLOCATED = pytest.mark.filterwarnings(
@@ -227,22 +227,14 @@ def test_impossible_signals_are_rejected(pair, column, wrong):
         buffer.load_state_dict(state)
 
 
-def seal_again(folder):
-    """Make the checksums of a dump those of its present files, as an attacker could."""
-    seal_dump(folder / "dump-1/storage", folder / "dump-1/storage")
-    seal_dump(folder, folder / "dump-1")
-
-
-@pytest.mark.parametrize("file", ["sampler/sampler.pt", "buffer.pt"])
-def test_folder_with_code_in_it_is_rejected_and_not_executed(file, tmp_path):
+def test_folder_with_code_in_it_is_rejected_and_not_executed(tmp_path):
     first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
     first.extend(make_transitions(CAPACITY))
     second.extend(make_transitions(9, seed=3))
     first.dumps(tmp_path / "buffer")
-    path, trap = tmp_path / "buffer/dump-1" / file, tmp_path / "trap"
-    save_atomically({"_format": 1, "x": Trap(trap)}, path)
-    seal_again(tmp_path / "buffer")
-    with rejected(second, pickle.UnpicklingError, f"{path.name} holds more than tensors"):
+    trap = tmp_path / "trap"
+    save_atomically({**snapshot(first), "x": Trap(trap)}, tmp_path / "buffer/state.pt")
+    with rejected(second, pickle.UnpicklingError, "state.pt holds more than tensors"):
         second.loads(tmp_path / "buffer")
     assert not trap.exists()
 

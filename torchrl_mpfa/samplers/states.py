@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_not_negative
 from torchrl_mpfa.samplers.trees import is_learned
-from torchrl_mpfa.saving import check_saved, load_safely, save_atomically
+from torchrl_mpfa.saving import check_saved, dump, open_dump
 
 FORMAT = 5
 """Version of saved states."""
@@ -65,12 +64,11 @@ class SavedSampler:
 
     def dumps(self, path: str | Path) -> None:
         """Save the state in a folder."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        save_atomically(self.state_dict(), Path(path) / "sampler.pt")
+        dump(self.state_dict(), path)
 
     def loads(self, path: str | Path) -> None:
         """Restore the state from a folder, or raise as :meth:`load_state_dict`."""
-        self.load_state_dict(load_safely(Path(path) / "sampler.pt"))
+        self.load_state_dict(open_dump(path))
 
 
 class SavedTrees(SavedSampler, PrioritizedSampler):
@@ -98,13 +96,6 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
             "_learned": is_learned(kept).cpu(),
             "_leaves": self.trees.leaves(slots).cpu(),
         }
-
-    def dumps(self, path: str | Path) -> None:
-        """Save the state in a folder, with its plain values in a file where TorchRL has them."""
-        super().dumps(path)
-        plain = {k: v for k, v in self.state_dict().items() if not isinstance(v, Tensor)}
-        text = json.dumps(plain, indent=2, default=lambda value: f"{[*value.shape]} numbers")
-        (Path(path) / "sampler_metadata.json").write_text(text, encoding="utf-8")
 
     def _restore(self, state: dict[str, Any]) -> None:
         names, size = ("_priorities", "_learned", "_leaves"), self._max_capacity

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
-import json
 import mmap
 import os
-from collections import OrderedDict
 from collections.abc import Mapping, Set
 from ctypes import c_size_t, c_void_p
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import MemoryMappedTensor, TensorDict, is_tensor_collection
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorStorageCheckpointer
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import check_counts, generator_on
-from torchrl_mpfa.saving import check_saved, open_dump, seal_dump
+from torchrl_mpfa.saving import allocate, dump, open_dump
 from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.schema import as_index
+from torchrl_mpfa.storages.states import load_part, restore_rows, state_of
 
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
@@ -152,71 +150,20 @@ class SignalTensorStorage(LazyTensorStorage):
             KeyError: If an entry is missing; nothing is changed.
             ValueError: If the data are of another capacity or form; nothing is changed.
         """
-        check_saved("storage", state_dict, ("_storage", "_len", "initialized"))
-        data = _of_any_device(state_dict["_storage"])
-        tree = TensorDict()
-        rows = tree.load_state_dict(data, strict=False) if isinstance(data, Mapping) else data
-        self._check_saved(rows, state_dict["_len"])
-        super().load_state_dict({**state_dict, "_storage": data})
-        self._settle_loaded()
+        restore_rows(self, state_dict)
 
     def dumps(self, path: str | Path) -> None:
-        """Save the data in a folder, with checksums, or raise ``OSError`` if it is full."""
-        path = Path(path)
-        path.mkdir(exist_ok=True)
-        if is_tensor_collection(data := self._storage):
-            with NamedTemporaryFile(dir=path) as room:  # TorchRL asks for none.
-                allocate(room.name, data.bytes())
-        super().dumps(path)
-        seal_dump(path, path)
+        """Save the data in a folder, with a checksum, or raise ``OSError`` if it is full."""
+        dump(state_of(self), path)
 
     def loads(self, path: str | Path) -> None:
         """Restore the data from a folder.
 
         Raises:
-            ValueError: If a file is damaged, missing, or could execute something, or the data are
-                of another capacity or form; nothing is changed.
+            ValueError: If the file is damaged or could execute something, or the data are of
+                another capacity or form; nothing is changed.
         """
-        path = open_dump(path)
-        checkpointer = self.checkpointer
-        if type(checkpointer) is not TensorStorageCheckpointer or checkpointer._load_hooks:
-            # In a form of its own, such as that of TED, which it makes rows of.
-            twin = LazyTensorStorage(self.max_size, ndim=self.ndim)
-            twin.checkpointer = checkpointer
-            twin.loads(path)
-            self.load_state_dict(twin.state_dict())
-            return
-        notes = json.loads((path / "storage_metadata.json").read_text(encoding="utf-8"))
-        rows = None if notes["is_pytree"] else TensorDict.load_memmap(path, allow_pickle=False)
-        self._check_saved(rows, notes["len"])
-        super().loads(path)
-        self._settle_loaded()
-
-    def _check_saved(self, data: Any, length: Any) -> None:
-        if type(length) is not int or not 0 <= length <= self.max_size:
-            raise ValueError(
-                f"'_len' of the saved storage must be in [0, {self.max_size}], got {length!r}"
-            )
-        if length and isinstance(data, TensorDictBase):
-            slots = data.shape[: self.ndim]
-            if slots.numel() != self.max_size:
-                raise ValueError(
-                    f"the saved storage must have {self.max_size} slots, got {[*slots]}"
-                )
-            stored: Any = self._storage if self.initialized else None
-            if type(stored) is TensorDict and len(stored.keys()):
-                # TorchRL would leave the old values of an entry that is missing.
-                keys = list(stored.keys(True, True))
-                RowPlan(stored, self.ndim, keys).check(data, self.ndim)
-
-    def _settle_loaded(self) -> None:
-        where = _common_device(self._storage) if self.initialized else None
-        if getattr(self, "device", None) == "auto":
-            # TorchRL finds it out at the first write, which a restored storage has had.
-            self.device = (where or torch.device("cpu")) if self.initialized else "auto"
-        elif where not in (None, self.device):
-            # What was saved on another device.
-            self._storage = self._storage.to(self.device)
+        load_part(self, open_dump(path))
 
 
 class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
@@ -293,11 +240,6 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
         for entry in entries:
             _expect_random(entry)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the data, or raise ``ValueError`` for what could not be mapped again."""
-        self._check_mapped()
-        return super().state_dict()
-
     def _check_mapped(self) -> None:
         """Reject entries without numbers, which TensorDict maps at the first write alone."""
         for entry in tree_leaves(self._storage):
@@ -308,6 +250,7 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
                 )
 
     def _forget_form(self) -> None:
+        """Remove the files that were made for the form of the first transitions."""
         for file in self._files() - self._files_before:
             file.unlink()
 
@@ -359,39 +302,6 @@ def slots_of(storage: Any, index: Any) -> Tensor:
     if storage.ndim > 1:
         slots = slots.reshape(storage._total_shape)
     return slots[list(index) if isinstance(index, range) else index].reshape(-1)
-
-
-def _common_device(data: Any) -> torch.device | None:
-    """Return the device of all tensors in a tensordict; None for several, or other entries."""
-    if isinstance(data, Tensor):
-        return data.device
-    if type(data) is not TensorDict:
-        return None
-    devices = {_common_device(entry) for entry in data.values()}
-    return devices.pop() if len(devices) == 1 else None
-
-
-def _of_any_device(data: Any) -> Any:
-    """Return saved data without the name of their device, for which another one rejects them."""
-    metadata = getattr(data, "_metadata", None)
-    if metadata is None:
-        return data
-    copied = OrderedDict(data)
-    copied._metadata = {name: {**note, "device": None} for name, note in metadata.items()}  # type: ignore[attr-defined]
-    return copied
-
-
-def allocate(path: str | Path, size: int = 0) -> None:
-    """Reserve room on the disk for a file that is mapped to memory, or raise ``OSError``.
-
-    A write to a mapped file for which the disk has no room would kill the process.
-    """
-    with open(path, "r+b") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, size or os.path.getsize(path) or 1)
-        except OSError as error:
-            error.filename = str(path)
-            raise
 
 
 def _expect_random(entry: Tensor) -> None:

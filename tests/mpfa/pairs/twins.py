@@ -40,7 +40,7 @@ AXES = {
 }
 
 
-COPIED = ("state_dict", "torch.save", "pickle", "deepcopy")
+COPIED = ("pickle", "deepcopy")
 
 
 @contextmanager
@@ -76,8 +76,8 @@ def fits(choice):
         of("mode") == "compiled" and of("saved") not in (None, "not"),
         of("mode") == "compiled" and of("rounds") == "three batches",
         of("mode") == "compiled" and of("changed") not in (None, "nothing"),
-        # TorchRL saves no list in a folder.
-        listed and of("saved") in ("dumps", "checkpoint", "flat", "nested"),
+        # TorchRL's checkpointers of trajectories save no list.
+        listed and of("saved") in ("flat", "nested"),
         # TED asks for the entries of trajectories alone, in their order of writing.
         of("saved") in ("flat", "nested") and of("transform") in ("n steps", "hindsight"),
         of("saved") in ("flat", "nested") and of("form") in ("nested", "empty"),
