@@ -23,8 +23,10 @@ def lines(name: str) -> list[str]:
 
 
 def test_citation_and_changelog_have_the_version_of_the_package() -> None:
-    version, *_ = re.findall(r"^## \[([\d.]+)\]", "\n".join(lines("CHANGELOG.md")), re.MULTILINE)
-    assert f"version: {version}" in lines("CITATION.cff")
+    found = re.search(r"^## \[([\d.]+)\] - (\S+)$", "\n".join(lines("CHANGELOG.md")), re.MULTILINE)
+    assert found is not None
+    version, date = found.groups()
+    assert {f"version: {version}", f"date-released: {date}"} <= {*lines("CITATION.cff")}
     assert version == torchrl_mpfa.__version__
 
 

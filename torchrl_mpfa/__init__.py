@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from torchrl_mpfa.storages import SignalTensorStorage as SignalTensorStorage
     from torchrl_mpfa.updates import run_updates as run_updates
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 _NAMES = {
     "adjustment": "Adjustment PositiveBoost PositiveDecay",
