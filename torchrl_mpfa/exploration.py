@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +25,8 @@ class GaussianNoise(AdditiveGaussianModule):
     by ``step``, as TorchRL's does.
 
     Args:
-        spec: Range of actions, such as ``env.action_spec``, in which noisy actions are held.
+        spec: Range of actions, such as ``env.action_spec``, in which noisy actions are held; None:
+            it is set later, as TorchRL's collectors do.
         sigma_init: Standard deviation at the start.
         sigma_end: Standard deviation at the end; no larger.
         annealing_num_steps: Steps in which it falls.
@@ -66,9 +69,16 @@ class GaussianNoise(AdditiveGaussianModule):
         self._kept: tuple[Bounded, Tensor, Tensor] | None = None
 
     def noisy(self, action: Tensor) -> Tensor:
-        """Add noise to actions, ``[..., A]``, and hold the sum in their range."""
+        """Add noise to actions, ``[..., A]``, and hold the sum in their range.
+
+        Raises:
+            ValueError: If the noise has no spec yet.
+        """
+        if self.spec is None:
+            raise ValueError("spec must be an action spec, got None: set it, as env.action_spec")
         # Where TorchRL draws it, so that the numbers are the same.
-        noise = torch.randn(action.shape, dtype=self.mean.dtype, device=self.mean.device)
+        mean = self.mean
+        noise = torch.randn(action.shape, dtype=mean.dtype, device=mean.device)
         moved = action + noise.to(action.device) * self.sigma
         spec = self.spec[self.action_key]
         if not isinstance(spec, Bounded):
@@ -89,11 +99,19 @@ class GaussianNoise(AdditiveGaussianModule):
 
     def step(self, frames: int = 1) -> None:
         """Lower the standard deviation by as many steps."""
-        sigma, end = self.sigma.item(), self.sigma_end.item()
+        held, end, first = self.sigma, self.sigma_end.item(), self.sigma_init
+        sigma = held.item()
         if sigma <= end:
             return
-        slope = ((self.sigma_init - self.sigma_end) / self.annealing_num_steps).item()
+        slope = _slope(first.item(), end, self.annealing_num_steps, first.dtype)
         for _ in range(frames):
             # Rounded in each step, as TorchRL's tensors are.
             sigma = float(np.float32(max(end, sigma - slope)))
-        self.sigma.fill_(sigma)
+        held.fill_(sigma)
+
+
+@cache
+def _slope(first: float, last: float, steps: int, dtype: torch.dtype) -> float:
+    """Compute the fall in a step, rounded as TorchRL's tensors are."""
+    fall = torch.tensor(first, dtype=dtype) - torch.tensor(last, dtype=dtype)
+    return (fall / steps).item()

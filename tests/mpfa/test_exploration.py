@@ -114,6 +114,14 @@ def test_noise_keeps_to_the_spec_that_it_has() -> None:
         assert each.noisy(action).abs().max() == 0.5
 
 
+def test_noise_without_a_spec_asks_for_one() -> None:
+    noise = GaussianNoise()
+    with pytest.raises(ValueError, match="spec must be an action spec, got None: set it"):
+        noise.noisy(torch.zeros(2))
+    noise.spec = SPECS["unit"]
+    assert noise.noisy(torch.zeros(2)).shape == (2,)
+
+
 def test_saved_noise_is_that_of_torchrl() -> None:
     theirs, ours = AdditiveGaussianModule(SPECS["unit"], 1.0, 0.1), GaussianNoise(SPECS["unit"])
     theirs.step(300)

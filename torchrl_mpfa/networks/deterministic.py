@@ -66,7 +66,6 @@ class DirectModule(TensorDictModule):
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         return dict(zip(self.out_keys, outputs, strict=True))
 
-    @torch.no_grad()
     def act(self, *inputs: Tensor) -> Tensor:
         """Choose actions without noise, ``[..., A]``, or one-hot, ``[..., K]``; for policies alone.
 
@@ -77,7 +76,8 @@ class DirectModule(TensorDictModule):
         Returns:
             What the policy writes as ``"action"``, without gradients.
         """
-        return self.outputs(dict(zip(self.in_keys, inputs, strict=True)))["action"]
+        with torch.no_grad():
+            return self.outputs(dict(zip(self.in_keys, inputs, strict=True)))["action"]
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,6 @@ class StochasticActor(ProbabilisticActor):
             before, _ = _sample_normal(before, outputs["scale"])
         return {**outputs, "action": self.mean_action(before)}
 
-    @torch.no_grad()
     def act(self, observation: Tensor, *, random: bool = False) -> Tensor:
         """Choose actions, ``[..., A]``, without gradients, whatever the exploration type is.
 
@@ -147,7 +146,8 @@ class StochasticActor(ProbabilisticActor):
         Returns:
             Actions.
         """
-        return self.outputs({"observation": observation}, random=random)["action"]
+        with torch.no_grad():
+            return self.outputs({"observation": observation}, random=random)["action"]
 
     def mean_action(self, preactivation: Tensor) -> Tensor:
         """Squash means or samples before the tanh, ``[..., A]``, to actions."""
