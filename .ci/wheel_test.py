@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -141,6 +142,37 @@ def check_contents(wheel: Path) -> None:
     print(f"{len(names)} files, of {', '.join(sorted(tops))}", flush=True)
 
 
+def check_tag(wheel: Path, folder: Path) -> None:
+    """Compare the wheel's platform with the symbols of its compiled library, as binutils list them.
+
+    A package index takes no ``linux_x86_64``.
+
+    Args:
+        wheel: The wheel.
+        folder: Where the library goes.
+
+    Raises:
+        SystemExit: If the wheel promises to load where a symbol is missing, or promises too little.
+    """
+    platform = wheel.stem.split("-")[-1]
+    with zipfile.ZipFile(wheel) as archive:
+        libraries = [name for name in archive.namelist() if name.endswith(".so")]
+        paths = [archive.extract(name, folder) for name in libraries]
+    if not paths:
+        if platform != "any":
+            raise SystemExit(f"the wheel for {platform} has no compiled loops")
+        return
+    if not platform.startswith("manylinux_2_") or shutil.which("objdump") is None:
+        print(f"the wheel is for {platform}, whose symbols are not looked at")
+        return
+    listed = subprocess.run(["objdump", "-T", *paths], capture_output=True, text=True, check=True)
+    newest = max(int(minor) for minor in re.findall(r"\(GLIBC_2\.(\d+)", listed.stdout))
+    promised = int(platform.split("_")[2])
+    if promised != max(newest, 17):
+        raise SystemExit(f"the wheel is for {platform}, its symbols are of glibc 2.{newest}")
+    print(f"the wheel is for {platform}, by symbols of glibc 2.{newest}", flush=True)
+
+
 def install(wheel: Path, folder: Path) -> tuple[Path, Path]:
     """Install the wheel in a new environment that sees this one's dependencies.
 
@@ -170,6 +202,7 @@ def main() -> None:
         folder = Path(name)
         wheel = build(folder / "dist")
         check_contents(wheel)
+        check_tag(wheel, folder / "library")
         python, packages = install(wheel, folder / "venv")
         elsewhere = folder / "elsewhere"
         elsewhere.mkdir()

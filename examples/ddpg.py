@@ -19,7 +19,6 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.modules import AdditiveGaussianModule
 from tqdm import tqdm
 
 import torchrl_mpfa as mpfa
@@ -108,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     )
 
     falling = max(int(0.4 * options.actions), 1)
-    noise = AdditiveGaussianModule(
+    noise = mpfa.GaussianNoise(
         env.action_spec, sigma_init=1.0, sigma_end=0.2, annealing_num_steps=falling
     )
     frames = ROBOTS * STEPS

@@ -26,11 +26,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import trange
 
 import torchrl_mpfa as mpfa
 from torchrl_mpfa.methods import loss_options, make_replay, method_named
+from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.saving import write_text_atomically
 
 BATCH_SIZE, WIDTH = 100, 256
@@ -80,7 +81,7 @@ def _tensor(state: NDArray[np.floating]) -> Tensor:
     return torch.as_tensor(state, dtype=torch.float32)
 
 
-def collect(task: Task, actor: nn.Module | None, source: np.random.Generator) -> TensorDict:
+def collect(task: Task, actor: DirectModule | None, source: np.random.Generator) -> TensorDict:
     """Step a round by the actor with noise, or at random; return its rows.
 
     Args:
@@ -97,24 +98,17 @@ def collect(task: Task, actor: nn.Module | None, source: np.random.Generator) ->
         action = source.uniform(-1.0, 1.0, task.actions)
         if actor is not None:
             noise = NOISE * source.standard_normal(task.actions)
-            action = np.clip(act(actor, before) + noise, -1.0, 1.0)
+            action = np.clip(actor.act(before).numpy() + noise, -1.0, 1.0)
         rows.append(task.step(before, action.astype(np.float32)))
     return torch.stack(rows)
 
 
-def act(actor: nn.Module, observation: Tensor) -> NDArray[np.float32]:
-    """Return the actor's action without noise. Its first output is the action before the tanh."""
-    with torch.no_grad():
-        action: NDArray[np.float32] = actor(observation)[1].numpy()
-    return action
-
-
-def score(name: str, actor: nn.Module, *, seed: int) -> float:
+def score(name: str, actor: DirectModule, *, seed: int) -> float:
     """Return the mean return of episodes without noise."""
     task, total, ended = Task(name, seed=seed), 0.0, 0
     while ended < EPISODES:
         before = _tensor(task.state)
-        after = task.step(before, act(actor, before))["next"]
+        after = task.step(before, actor.act(before).numpy())["next"]
         total, ended = total + after["reward"].item(), ended + int(after["done"])
     task.env.close()
     return total / EPISODES
@@ -146,12 +140,12 @@ def train(options: argparse.Namespace) -> list[list[object]]:
     rows: list[list[object]] = []
     for done in (bar := trange(STEPS_A_ROUND, options.steps + 1, STEPS_A_ROUND, unit="round")):
         learning = done > options.start
-        replay.buffer.extend(collect(task, actor.module if learning else None, source))
+        replay.buffer.extend(collect(task, actor if learning else None, source))
         if learning:
             replay.anneal(done / options.steps)  # As in PER, beta rises to 1.
             mpfa.run_updates(replay.buffer, learner, replay.select, updates=STEPS_A_ROUND)
         if done % options.every < STEPS_A_ROUND:
-            reached = score(options.task, actor.module, seed=1_000_000)
+            reached = score(options.task, actor, seed=1_000_000)
             rows.append([options.task, f"td3/{options.replay}", options.seed, done, reached])
             bar.set_postfix_str(f"return {reached:.0f}")
     return rows

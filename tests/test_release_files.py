@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shutil
 import subprocess
 from pathlib import Path
@@ -22,9 +23,37 @@ def lines(name: str) -> list[str]:
 
 
 def test_citation_and_changelog_have_the_version_of_the_package() -> None:
-    version, *_ = re.findall(r"^## \[([\d.]+)\]", "\n".join(lines("CHANGELOG.md")), re.MULTILINE)
-    assert f"version: {version}" in lines("CITATION.cff")
+    found = re.search(r"^## \[([\d.]+)\] - (\S+)$", "\n".join(lines("CHANGELOG.md")), re.MULTILINE)
+    assert found is not None
+    version, date = found.groups()
+    assert {f"version: {version}", f"date-released: {date}"} <= {*lines("CITATION.cff")}
     assert version == torchrl_mpfa.__version__
+
+
+HERE = ("linux_x86_64", "manylinux_2_36_x86_64", "manylinux_2_35_x86_64")
+
+
+@pytest.mark.parametrize(
+    ("library", "platforms", "tag"),
+    [
+        (b"\0GLIBC_2.2.5\0GLIBC_2.29\0GLIBC_2.14\0", HERE, "manylinux_2_29_x86_64"),
+        (b"\0GLIBC_2.2.5\0", HERE, "manylinux_2_17_x86_64"),
+        (b"\0GLIBC_2.27\0", ("manylinux_2_39_riscv64",), "manylinux_2_27_riscv64"),
+        (b"\0GLIBC_2.29\0GLIBC_ABI_DT_RELR\0", HERE, "manylinux_2_36_x86_64"),
+        (
+            b"libc.musl-x86_64.so.1",
+            ("musllinux_1_2_x86_64", "linux_x86_64"),
+            "musllinux_1_2_x86_64",
+        ),
+        (b"\xcf\xfa\xed\xfe", ("macosx_14_0_arm64", "macosx_13_0_arm64"), "macosx_14_0_arm64"),
+        (b"\0GLIBC_2.29\0", ("linux_sparc64",), "linux_sparc64"),
+    ],
+)
+def test_a_wheel_is_for_platforms_that_have_the_symbols_of_its_library(
+    library: bytes, platforms: tuple[str, ...], tag: str
+) -> None:
+    hook = runpy.run_path(str(ROOT / ".ci" / "hatch_build.py"))
+    assert hook["platform_tag"](library, platforms) == tag
 
 
 def test_the_hosted_checks_are_those_of_the_repository() -> None:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from torchrl_mpfa.adjustment import PositiveBoost as PositiveBoost
     from torchrl_mpfa.adjustment import PositiveDecay as PositiveDecay
     from torchrl_mpfa.buffer import SignalReplayBuffer as SignalReplayBuffer
+    from torchrl_mpfa.exploration import GaussianNoise as GaussianNoise
     from torchrl_mpfa.fusion import EntropyFusion as EntropyFusion
     from torchrl_mpfa.fusion import FixedFusion as FixedFusion
     from torchrl_mpfa.fusion import Fusion as Fusion
@@ -36,11 +37,12 @@ if TYPE_CHECKING:
     from torchrl_mpfa.storages import SignalTensorStorage as SignalTensorStorage
     from torchrl_mpfa.updates import run_updates as run_updates
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 _NAMES = {
     "adjustment": "Adjustment PositiveBoost PositiveDecay",
     "buffer": "SignalReplayBuffer",
+    "exploration": "GaussianNoise",
     "fusion": "EntropyFusion FixedFusion Fusion ScaledFusion",
     "learners": "DQN ActorCritic Learner",
     "losses": "write_signals",

@@ -17,9 +17,8 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, set_exploration_type
-from torchrl.envs.utils import ExplorationType, step_mdp
-from torchrl.modules import AdditiveGaussianModule
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
 
 from benchmarks.speed.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.speed.sbx_peer import IdleEnv
@@ -34,6 +33,7 @@ from benchmarks.speed.timing import (
 )
 from torchrl_mpfa import (
     ActorCritic,
+    GaussianNoise,
     Learner,
     MPFASampler,
     SignalReplayBuffer,
@@ -69,7 +69,7 @@ class Agent:
         of_algorithm = noise if algorithm == "td3" else {}
         self.learner = ActorCritic(actor, critic, compile=compile, **of_algorithm)
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
-        self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
+        self.noise = GaussianNoise(spec, sigma_init=0.2, sigma_end=0.2)
         self.buffer = SignalReplayBuffer(
             storage=SignalTensorStorage(CAPACITY, device="auto"),
             sampler=MPFASampler(CAPACITY),
@@ -77,13 +77,10 @@ class Agent:
         )
         self.buffer.extend(make_transitions(_FILL))
 
-    @torch.no_grad()
     def act(self, state: TensorDictBase) -> TensorDictBase:
         """Choose an action with noise."""
-        found = self.learner.policy.outputs(state)
-        with set_exploration_type(ExplorationType.RANDOM):
-            noisy = self.noise(TensorDict({"action": found["action"]}))
-        return state.set("action", noisy.get("action"))
+        chosen = self.learner.policy.act(state["observation"])
+        return state.set("action", self.noise.noisy(chosen))
 
     def learn(self, transition: TensorDictBase) -> None:
         """Store a transition of batch size ``[1]``, and make one update."""

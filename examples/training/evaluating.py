@@ -118,9 +118,7 @@ class Conditions:
     def are_of(self, settings: Mapping[str, Any]) -> bool:
         """Return True if the ``settings.json`` of an evaluation has these conditions."""
         mine = json.loads(json.dumps(self.as_json()))
-        # An evaluation that is older than seeds had the first one.
-        theirs = {"seed": 0, **settings}
-        return all(theirs.get(name) == mine.get(name) for name in (*mine, *_AS_TRAINED))
+        return all(settings.get(name) == mine.get(name) for name in (*mine, *_AS_TRAINED))
 
 
 def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:

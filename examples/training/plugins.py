@@ -10,8 +10,6 @@ from collections.abc import Iterable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
-# Plugins of 0.4 import it from here.
-from torchrl_mpfa.methods import register_signal as register_signal
 from training.files import digest
 
 _WORD = "plugin="

@@ -123,7 +123,6 @@ def later(generator: dict[str, Any]) -> dict[str, Any]:
 
 
 SPOILED: list[tuple[Callable[[Any], None], str]] = [
-    (value({}, "batch"), "earlier version, and its episodes under way cannot be continued"),
     (lambda state: state.pop("robots"), r"no state_dict\(\) gave it, KeyError\('robots'\)"),
     (value(None, "arguments"), r"no state_dict\(\) gave it, AttributeError"),
     (lambda state: state["arguments"].pop("split"), "split = 'train', got one with None"),

@@ -174,12 +174,6 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
     for other in others:
         evaluate.main([*how, *other, *study])
         assert not job.is_evaluated(asked)
-    # Written before there were seeds and noise.
-    evaluate.main(how)
-    file = job.results(asked) / files.SETTINGS
-    found = json.loads(file.read_text())
-    file.write_text(json.dumps({name: found[name] for name in found if name != "seed"}))
-    assert job.is_evaluated(asked)
 
 
 @pytest.mark.parametrize("words", [["run"], ["--policy", "dwa"]], ids=" ".join)

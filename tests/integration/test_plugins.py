@@ -165,7 +165,7 @@ def test_a_comparison_gives_its_plugin_to_every_command(mine: Path, tmp_path: Pa
         ),
         (
             "wrong.py",
-            "from training.plugins import register_signal\nregister_signal('td_error', len)",
+            "from torchrl_mpfa.methods import register_signal\nregister_signal('td_error', len)",
             "name must be one that no loss has, got 'td_error'",
         ),
     ],

@@ -42,6 +42,8 @@ class DirectModule(TensorDictModule):
         >>> double = DirectModule(lambda x: 2 * x, in_keys=["x"], out_keys=["y"])
         >>> double.outputs({"x": torch.ones(2)})["y"]
         tensor([2., 2.])
+        >>> make_actor(24, 2).act(torch.rand(1, 24)).shape
+        torch.Size([1, 2])
     """
 
     def __init__(
@@ -63,6 +65,19 @@ class DirectModule(TensorDictModule):
         outputs = self.module(*[inputs.get(key) for key in self.in_keys])
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         return dict(zip(self.out_keys, outputs, strict=True))
+
+    def act(self, *inputs: Tensor) -> Tensor:
+        """Choose actions without noise, ``[..., A]``, or one-hot, ``[..., K]``; for policies alone.
+
+        Args:
+            *inputs: A tensor per key of ``in_keys``, of :func:`make_actor` observations
+                ``[..., O]``.
+
+        Returns:
+            What the policy writes as ``"action"``, without gradients.
+        """
+        with torch.no_grad():
+            return self.outputs(dict(zip(self.in_keys, inputs, strict=True)))["action"]
 
 
 @dataclass(frozen=True)

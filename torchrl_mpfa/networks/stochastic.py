@@ -41,8 +41,7 @@ def sample_tanh_normal(
         >>> action.shape, log_density.shape
         (torch.Size([3, 2]), torch.Size([3]))
     """
-    noise = torch.randn_like(loc)
-    before = loc + scale * noise
+    before, noise = _sample_normal(loc, scale)
     of_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi)
     # The logarithm of 1 - tanh(u)^2, which would be that of zero for a large u.
     of_tanh = 2.0 * (math.log(2.0) - before - softplus(-2.0 * before))
@@ -50,6 +49,12 @@ def sample_tanh_normal(
     if action_scale is None:
         return action, log_density
     return action_scale(action), log_density - action_scale.half_width.log().sum()
+
+
+def _sample_normal(loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample a Gaussian; return the noise of unit scale as well."""
+    noise = torch.randn_like(loc)
+    return loc + scale * noise, noise
 
 
 class StochasticNetwork(Layers):
@@ -82,6 +87,8 @@ class StochasticActor(ProbabilisticActor):
         >>> policy = make_stochastic_actor(24, 2)
         >>> sorted(policy.outputs({"observation": torch.rand(5, 24)}))
         ['action', 'preactivation', 'scale']
+        >>> policy.act(torch.rand(5, 24), random=True).shape
+        torch.Size([5, 2])
     """
 
     def __init__(
@@ -108,24 +115,42 @@ class StochasticActor(ProbabilisticActor):
         return [*self.module[0].module.layers(), nn.Tanh(), *scale]
 
     def outputs(
-        self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
+        self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase, *, random: bool | None = None
     ) -> dict[NestedKey, Tensor]:
         """Compute the outputs by key, and leave the inputs as they are.
 
-        The action is random under ``set_exploration_type(ExplorationType.RANDOM)``; otherwise it
-        is the tanh of the mean, scaled to the bounds of actions.
+        Args:
+            inputs: Tensors by key, in a mapping or a tensordict.
+            random: True to sample the action; False for that of the mean. None: it is random under
+                ``set_exploration_type(ExplorationType.RANDOM)``.
+
+        Returns:
+            Outputs by key.
         """
         outputs: dict[NestedKey, Tensor] = self.module[0].outputs(inputs)
-        if (exploration_type() or self.default_interaction_type) is ExplorationType.RANDOM:
-            action, _ = sample_tanh_normal(
-                outputs["preactivation"], outputs["scale"], self.action_scale
-            )
-        else:
-            action = self.mean_action(outputs["preactivation"])
-        return {**outputs, "action": action}
+        if random is None:
+            asked = exploration_type() or self.default_interaction_type
+            random = asked is ExplorationType.RANDOM
+        before = outputs["preactivation"]
+        if random:
+            before, _ = _sample_normal(before, outputs["scale"])
+        return {**outputs, "action": self.mean_action(before)}
+
+    def act(self, observation: Tensor, *, random: bool = False) -> Tensor:
+        """Choose actions, ``[..., A]``, without gradients, whatever the exploration type is.
+
+        Args:
+            observation: Observations, ``[..., O]``.
+            random: True to sample the actions; False for those of the means.
+
+        Returns:
+            Actions.
+        """
+        with torch.no_grad():
+            return self.outputs({"observation": observation}, random=random)["action"]
 
     def mean_action(self, preactivation: Tensor) -> Tensor:
-        """Squash the mean before the tanh, ``[..., A]``, to the action without noise."""
+        """Squash means or samples before the tanh, ``[..., A]``, to actions."""
         action = torch.tanh(preactivation)
         return action if self.action_scale is None else self.action_scale(action)
 

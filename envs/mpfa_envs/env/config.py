@@ -81,10 +81,10 @@ _DESCRIBED: Final = ("robot", "clearance", "contact", "reward", "progress_scale"
 """Fields that a description has in another form."""
 _MOST_RAYS: Final = 3
 """Rays of a sector in training; the nearest of more differs little, and each takes time."""
-_REPLACED: Final = {
+_DERIVED: Final = {
     "collision_distance": "give clearance, counted from the robot's rim, or contact=True",
 }
-"""What to say of arguments of earlier versions."""
+"""What to say of properties that are given as arguments."""
 _PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale", "step_cost")
 
 
@@ -399,7 +399,7 @@ def check_names(task: Mapping[str, Any], others: Iterable[str]) -> None:
     """Raise if an argument is neither a field of the task nor one of the others."""
     own = {each.name for each in fields(TaskConfig)}
     for name in task.keys() - own:
-        said = _REPLACED.get(name) or did_you_mean(name, [*own, *others])
+        said = _DERIVED.get(name) or did_you_mean(name, [*own, *others])
         hint = f": {said}" if said else ""
         # In Python's words, by which TorchRL knows that an environment takes no `frameskip`.
         raise TypeError(f"got an unexpected keyword argument {name!r}{hint}")

@@ -372,11 +372,6 @@ def read_state(
 ) -> tuple[list[EpisodeState], list[NDArray[np.float64]], list[np.random.Generator | None]]:
     """Check a state: beginnings, wheel speeds since, and generators of the next episodes."""
     try:
-        if "batch" in state:
-            raise ValueError(
-                "it is of an earlier version, and its episodes under way cannot be continued: "
-                "begin new ones with reset()"
-            )
         for name, value in arguments.items():
             if (found := state["arguments"].get(name)) != value:
                 raise ValueError(

@@ -276,7 +276,7 @@ def _read(content: bytes) -> Policy:
 
 
 def _for_any_task(env_arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out the time limit, which earlier versions kept: it is the task's."""
+    """Leave out the time limit, which files of the package's policies have: it is the task's."""
     return {name: value for name, value in env_arguments.items() if name != "max_steps"}
 
 

@@ -129,21 +129,20 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
     """Load a state into a run, but for the robots: these may begin new episodes."""
     run.schedule.load_state_dict(state["schedule"])
     run.updates = state["updates"]
-    run.waiting = state.get("waiting", 0) * run.settings.robots
-    run.waiting += state.get("waiting_actions", 0)
+    run.waiting = state["waiting"] * run.settings.robots
+    run.waiting += state["waiting_actions"]
     run.learner.load_state_dict(state["learner"])
     run.buffer.load_state_dict(state["buffer"])
     run.explorer.load_state_dict(state["explorer"])
     if run.bonus is not None:
         run.bonus.restore(state["curiosity"])
-    run.signals.load_state_dict(state.get("signals", {}))
+    run.signals.load_state_dict(state["signals"])
     if state["best"] is not None:
         run.best = copy.deepcopy(run.learner.policy)
         run.best.load_state_dict(state["best"])
     run.records = [EpisodeRecord(**record) for record in state["records"]]
     run.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
-    if "log" in state:  # A checkpoint may be older than the rows.
-        run.log.load_state_dict(state["log"])
+    run.log.load_state_dict(state["log"])
     set_random_state(run.settings.device, state["random"])
 
 

@@ -196,10 +196,9 @@ class Robots:
     def recall(self, state: dict[str, Any]) -> None:
         """Restore what counts for the whole run, and which episodes were in progress."""
         self.seconds = state["seconds"]
-        self.given_up = state.get("given_up", 0)
+        self.given_up = state["given_up"]
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
-        if "numbers" in state:
-            self._numbers, self._begun = state["numbers"].clone(), state["begun"]
+        self._numbers, self._begun = state["numbers"].clone(), state["begun"]
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
         """Restore a state of :meth:`state_dict`."""

@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import TensorSpec
-from torchrl.envs import set_exploration_type
-from torchrl.envs.utils import ExplorationType
-from torchrl.modules import AdditiveGaussianModule
 
+from torchrl_mpfa.exploration import GaussianNoise
 from torchrl_mpfa.networks import DirectModule, StochasticActor
 from training.settings.train import ExplorationSettings
 
@@ -96,7 +93,7 @@ class NoisyPolicy(SharedNoise):
     ) -> None:
         super().__init__(settings, action_spec.shape[0])
         self.policy = policy
-        self.noise = AdditiveGaussianModule(
+        self.noise = GaussianNoise(
             action_spec,
             sigma_init=settings.sigma,
             sigma_end=settings.sigma_end,
@@ -110,13 +107,11 @@ class NoisyPolicy(SharedNoise):
 
     def act(self, observation: Tensor) -> Tensor:
         """Return the policy's actions with noise."""
-        chosen = self.policy.outputs({"observation": observation})["action"]
-        self._behavior = chosen.cpu(), self.shares * float(self.noise.sigma)
-        with set_exploration_type(ExplorationType.RANDOM):
-            noisy = self.noise(TensorDict({"action": chosen})).get("action")
+        chosen = self.policy.act(observation)
+        self._behavior = chosen.cpu(), self.shares * self.noise.sigma.item()
+        noisy = self.noise.noisy(chosen)
         self.noise.step(len(observation))
-        action: Tensor = chosen.lerp(noisy, self.shares.to(chosen.device))
-        return action
+        return chosen.lerp(noisy, self.shares.to(chosen.device))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the noise, and the shares of the episodes."""
@@ -151,7 +146,7 @@ class EpsilonGreedy(SharedNoise):
 
     def act(self, observation: Tensor) -> Tensor:
         """Return one-hot choices, shape ``[N, K]``."""
-        best = self.policy.outputs({"observation": observation})["action"]
+        best = self.policy.act(observation)
         anything = torch.randint(best.shape[1], (len(best),))
         chosen = torch.nn.functional.one_hot(anything, best.shape[1]).to(best.device)
         self._behavior = best.float().cpu(), self.epsilon * self.shares
@@ -177,6 +172,8 @@ class RandomPolicy(Explorer):
         settings: ``sigma_end`` stands for the spread of the actions.
     """
 
+    policy: StochasticActor
+
     def __init__(self, policy: StochasticActor, settings: ExplorationSettings) -> None:
         self.policy, self.settings = policy, settings
 
@@ -187,8 +184,7 @@ class RandomPolicy(Explorer):
 
     def act(self, observation: Tensor) -> Tensor:
         """Sample actions from the policy."""
-        with set_exploration_type(ExplorationType.RANDOM):
-            found = self.policy.outputs({"observation": observation})
+        found = self.policy.outputs({"observation": observation}, random=True)
         mean = self.policy.mean_action(found["preactivation"]).cpu()
         action: Tensor = found["action"]
         self._behavior = mean, torch.full((len(mean), 1), self.sigma)

@@ -388,25 +388,10 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     OmegaConf.set_struct(values, False)
     for name in ("defaults", "hydra"):
         values.pop(name, None)
-    noise = OmegaConf.select(values, "environment.noise") if isinstance(config, dict) else None
-    # Runs of earlier versions have it, in time steps.
-    if late := (noise or {}).pop("latency", 0):
-        raise ValueError(
-            f"environment.noise.latency must be 0, got {late}: train a policy with "
-            "environment.latency, in seconds, in its place"
-        )
-    if workers := (values.pop("ray", None) or {}).get("workers"):
-        raise ValueError(
-            f"ray.workers must be 0, got {workers}: a run drives its robots itself, and Ray is for "
-            "comparisons"
-        )
     structure = OmegaConf.structured(TrainSettings)
     if "method" in values:
         # Each method has settings of its own: its name says which.
         structure.method = method_named(values.method.name)
-        # Of earlier versions all methods have it.
-        if values.method.get("optimizer") == "adam" and not hasattr(structure.method, "optimizer"):
-            values.method.pop("optimizer")
     merged = OmegaConf.merge(structure, values)
     merged.pop("hydra", None)
     if merged.actions is not None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.data import Bounded
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule
 
 from torchrl_mpfa import make_actor, make_stochastic_actor, make_value_network
 from training.run.exploration import EpsilonGreedy, NoisyPolicy, RandomPolicy, make_explorer
@@ -89,3 +92,53 @@ def test_the_behavior_is_the_action_without_noise_and_the_noise_that_the_episode
     mean, sigma = explorer.behavior()
     torch.testing.assert_close(mean, expected)
     torch.testing.assert_close(sigma, torch.tensor([[0.0], [0.2], [0.4]]))
+
+
+@pytest.mark.parametrize("varied", [False, True])
+@pytest.mark.parametrize("robots", [1, 16])
+def test_actions_with_noise_are_those_of_torchrls_module(robots: int, varied: bool) -> None:
+    settings = ExplorationSettings(sigma=0.7, sigma_end=0.1, annealing_steps=50, varied=varied)
+    spec = Bounded(low=-1.0, high=1.0, shape=(robots, 2))
+    actor = make_actor(5, 2, final_init=1.0)
+    explorer = make_explorer(actor, settings, spec)
+    noise = AdditiveGaussianModule(spec, 0.7, 0.1, 50)
+    explorer.begin_episodes(torch.ones(robots, dtype=torch.bool))
+    for number, seen in enumerate(torch.randn(60, robots, 5)):
+        torch.manual_seed(number)
+        with set_exploration_type(ExplorationType.RANDOM), torch.no_grad():
+            chosen = actor(TensorDict({"observation": seen}))["action"]
+            noisy = noise(TensorDict({"action": chosen}))["action"]
+        spread = explorer.shares * noise.sigma
+        noise.step(robots)
+        torch.manual_seed(number)
+        found = explorer.act(seen)
+        assert torch.equal(found, chosen.lerp(noisy, explorer.shares))
+        mean, sigma = explorer.behavior()
+        assert torch.equal(mean, chosen) and torch.equal(sigma, spread)
+
+
+@pytest.mark.parametrize("robots", [1, 16])
+def test_choices_are_drawn_in_the_same_order_as_ever(robots: int) -> None:
+    settings = ExplorationSettings(annealing_steps=50)
+    network = make_value_network(5, 4, width=8, final_init=1.0)
+    explorer = EpsilonGreedy(network, settings, robots)
+    explorer.begin_episodes(torch.ones(robots, dtype=torch.bool))
+    for number, seen in enumerate(torch.randn(60, robots, 5)):
+        torch.manual_seed(number)
+        anything = torch.nn.functional.one_hot(torch.randint(4, (robots,)), 4)
+        at_random = torch.rand(robots, 1) < explorer.epsilon * explorer.shares
+        expected = torch.where(at_random, anything, network(TensorDict(observation=seen))["action"])
+        torch.manual_seed(number)
+        assert torch.equal(explorer.act(seen), expected)
+
+
+@pytest.mark.parametrize("robots", [1, 16])
+def test_a_random_policy_samples_as_under_torchrls_exploration(robots: int) -> None:
+    policy = make_stochastic_actor(5, 2, final_init=1.0)
+    explorer = make_explorer(policy, ExplorationSettings(), SPEC)
+    for number, seen in enumerate(torch.randn(60, robots, 5)):
+        torch.manual_seed(number)
+        expected, _, loc = policy.sample({"observation": seen})
+        torch.manual_seed(number)
+        assert torch.equal(explorer.act(seen), expected)
+        assert torch.equal(explorer.behavior()[0], policy.mean_action(loc))

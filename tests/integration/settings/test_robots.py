@@ -37,18 +37,6 @@ def test_settings_hold_the_values_of_the_file(tmp_path: Path) -> None:
         assert as_settings(saved).environment == settings.environment
 
 
-def test_saved_noise_with_a_latency_is_rejected_unless_it_is_none(tmp_path: Path) -> None:
-    file = tmp_path / "cart.yaml"
-    file.write_bytes(EXAMPLE_ROBOT.read_bytes())
-    settings = asked(file)
-    saved = asdict(settings)
-    saved["environment"]["noise"]["latency"] = 0
-    assert as_settings(saved).environment == settings.environment
-    saved["environment"]["noise"]["latency"] = 1
-    with pytest.raises(ValueError, match=r"environment\.noise\.latency must be 0, got 1: train a"):
-        as_settings(saved)
-
-
 def test_an_error_in_the_file_names_the_setting_and_the_line(tmp_path: Path) -> None:
     file = tmp_path / "cart.yaml"
     text = EXAMPLE_ROBOT.read_text(encoding="utf-8").replace("radius: 0.28", "radius: -0.28")

@@ -22,9 +22,7 @@ from training.settings.train import (
     Stage,
     TrackingSettings,
     TrainSettings,
-    as_settings,
     curriculum_name,
-    plain_settings,
 )
 
 
@@ -338,13 +336,6 @@ def test_a_learner_that_changes_a_default_keeps_its_rule(usual: TrainSettings) -
     settings.learner = GROUPS["learner"]["td3"](policy_delay=0)
     with pytest.raises(ValueError, match=r"learner.policy_delay must be at least 1, got 0"):
         check_settings(settings)
-
-
-def test_settings_of_a_run_whose_robots_drove_on_ray_are_rejected(usual: TrainSettings) -> None:
-    saved = plain_settings(usual)
-    assert as_settings({**saved, "ray": {"workers": 0, "steps": 16}}) == as_settings(saved)
-    with pytest.raises(ValueError, match=r"ray\.workers must be 0, got 2"):
-        as_settings({**saved, "ray": {"workers": 2}})
 
 
 ROOT = Path(__file__).parents[3]
