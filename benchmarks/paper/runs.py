@@ -68,8 +68,11 @@ def without(comparison: Comparison, kept: set[str]) -> Iterator[Comparison]:
         one = replace(comparison, seeds=(seed,))
         by_method: dict[tuple[Arm, ...], list[str]] = {}
         for method in one.methods:
+            # Each once, also of several learners.
             missing = tuple(
-                job.arm for job in one.jobs if job.method == method and job.name not in kept
+                dict.fromkeys(
+                    job.arm for job in one.jobs if job.method == method and job.name not in kept
+                )
             )
             by_method.setdefault(missing, []).append(method)
         for arms, methods in by_method.items():

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks import durations
 from benchmarks.paper.rows import write_rows
+from benchmarks.paper.runs import without
 from training.settings.train import TrainSettings, register
 
 
@@ -62,6 +63,23 @@ def test_time_over_planner_counts_kinds_alike_and_tasks_that_both_reach(tmp_path
     assert found["success"]["td3-mpfa_per-short"] == 1.0
     [outcomes, title, _] = durations.tables(tmp_path)[:3]
     assert "| TD3 | 0.4 s | 1 | 100.00% |" in outcomes and title == "### TD3"
+
+
+def test_kept_rows_are_those_of_sixty_runs_each_task_once() -> None:
+    rows = pd.read_csv(durations.KEPT / "tests.csv.gz")
+    assert not rows.duplicated(["arm", "seed", "world", "episode"]).any()
+    assert len(rows) == 60 * 6 * durations.EPISODES
+
+
+def test_the_tables_of_the_page_are_those_of_the_kept_rows() -> None:
+    page = Path("docs/results/drivers.md").read_text(encoding="utf-8")
+    assert durations.tables()[0] in page and durations.answer() in page
+
+
+def test_runs_that_are_missing_of_both_learners_are_made_once() -> None:
+    planned = durations.comparison(Path("runs"), (640,))
+    [part] = without(planned, {"td3-mpfa_per-short-640"})
+    assert len({job.name for job in part.jobs}) == len(part.jobs) == 6
 
 
 def test_answer_has_the_four_planned_differences(tmp_path: Path) -> None:
