@@ -29,6 +29,8 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "put": (_I, [_P, _P, _P, _I, _P, _P, _P, _I]),
     "query": (_D, [_P, _P, _P, _I, _I, _I]),
     "find": (None, [_P, _P, _I, _I, _P, _I, _P, _P]),
+    "waits": (_I, []),
+    "ask": (None, [_P, _I, _P, _I, _I]),
     "gather": (_I, [_P, _I, _P, _I, _I]),
     "not_finite": (_I, [_P, _I, _I]),
     "scatter": (_I, [_P, _I, _P, _I, _I]),

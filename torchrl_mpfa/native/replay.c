@@ -1,7 +1,14 @@
 // Loops of prioritized replay: trees and rows. A caller has checked types, devices and lengths.
+#define _GNU_SOURCE  // RUSAGE_THREAD.
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include <sys/mman.h>
+#include <sys/resource.h>
+#include <unistd.h>
+#ifndef RUSAGE_THREAD
+#define RUSAGE_THREAD RUSAGE_SELF
+#endif
 
 enum {
   WIDE = 16,  // Children of a node, also in trees.py.
@@ -190,6 +197,23 @@ typedef struct {
   int64_t bytes;   // Of one row.
   int64_t number;  // 4 or 8: single or double precision, which must be finite; else 0.
 } Column;
+
+// How often this thread waited for a page of a file.
+int64_t waits(void) {
+  struct rusage usage;
+  return getrusage(RUSAGE_THREAD, &usage) ? 0 : usage.ru_majflt;
+}
+
+// Have the system read the pages of rows all at once, where each would be waited for when it is touched.
+void ask(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
+  uintptr_t page = sysconf(_SC_PAGESIZE);
+  if (outside(slots, n, end)) return;
+  for (int64_t c = 0; c < count; c++)
+    for (int64_t i = 0; columns[c].bytes && i < n; i++) {
+      uintptr_t row = (uintptr_t)(columns[c].stored + slots[i] * columns[c].bytes), first = row / page * page;
+      madvise((void *)first, row + columns[c].bytes - first, MADV_WILLNEED);
+    }
+}
 
 // Copy rows of slots. Returns 1, and does nothing, if a slot is not below `end`.
 int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {

@@ -384,7 +384,8 @@ class SignalSampler(TreeSampler):
     ) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
         priority = self.combined(rows, weighing)
-        *_, reward, replay_count, written_at = rows.unbind(1)
+        columns = table.reward_column, table.count_column, table.time_column
+        reward, replay_count, written_at = (rows.select(1, column) for column in columns)
         numbers = [priority, reward, replay_count, slots, written_at]
         if batches > 1:
             numbers = [number.view(batches, -1) for number in numbers]

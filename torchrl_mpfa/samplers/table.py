@@ -362,7 +362,9 @@ def _priority(signal: Signal, value: Tensor) -> Tensor:
 
 
 def _written_priority(signal: Signal, value: Tensor) -> Tensor:
-    """Return the priorities of a signal known at the write, finite and not negative."""
+    """Return the priorities of a signal known at the write, of finite numbers."""
+    if signal.priority is None:
+        return value.abs()
     priority = _priority(signal, value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):
