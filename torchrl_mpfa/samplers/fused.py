@@ -12,8 +12,16 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage, TensorStorage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level, check_adjustments
-from torchrl_mpfa.checks import LEVEL, NOT_NEGATIVE, check, check_counts, check_index, check_shape
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, check_adjustments
+from torchrl_mpfa.checks import (
+    LEVEL,
+    NOT_NEGATIVE,
+    Level,
+    check,
+    check_counts,
+    check_index,
+    check_shape,
+)
 from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler

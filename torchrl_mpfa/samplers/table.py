@@ -11,9 +11,9 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import (
     COUNT_OR_ZERO,
+    Level,
     bounds,
     check,
     check_counts,
