@@ -321,7 +321,7 @@ class TreeSampler(SavedTrees):
         """Give the transitions in slots the highest priority."""
         priority = self._fresh_priority()
         if self._highest is None:
-            self.keep_highest(float(priority), int(slots[0]))
+            self._keep_highest(float(priority), int(slots[0]))
         fresh = slots.new_empty(slots.shape, dtype=torch.double).fill_(priority)
         self._write(slots, fresh, learned=False)
 
@@ -410,9 +410,9 @@ class TreeSampler(SavedTrees):
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
             stored = self.priorities(slots)  # Of a slot that is named twice the last one.
-            self.keep_highest(float(stored.max()), int(slots[stored.argmax()]))
+            self._keep_highest(float(stored.max()), int(slots[stored.argmax()]))
 
-    def keep_highest(self, highest: float, slot: int) -> None:
+    def _keep_highest(self, highest: float, slot: int) -> None:
         """Keep a priority and its slot if none was as high so far."""
         if self._highest is None or highest > self._highest:
             self._highest, self._highest_slot = highest, slot
