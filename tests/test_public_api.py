@@ -15,7 +15,17 @@ from torchrl_mpfa.samplers import SignalTable
 from torchrl_mpfa.samplers.trees import CompiledTrees
 
 ROOT = Path(__file__).resolve().parents[1]
-SAID = {"anneal", "stats", "clear", "blank", "replay_counts", "move_to", "take", "restored"}
+SAID = {
+    "anneal",
+    "stats",
+    "clear",
+    "blank",
+    "replay_counts",
+    "move_to",
+    "take",
+    "restored",
+    "fill_learned",
+}
 """Of users, and of a part to itself and its states."""
 SAID |= {"state_dict"}
 NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]

@@ -171,6 +171,11 @@ class SignalSampler(TreeSampler):
         self._counting = [adjust.counts for adjust in adjustments]
 
     @property
+    def recounts(self) -> bool:
+        """True if fusion or adjustments count at each update, or may have to."""
+        return self.fusion.every_batch or any(self._counting)
+
+    @property
     def reward_key(self) -> NestedKey:
         """Where the signed reward of a transition is read."""
         return self._reward_key
@@ -352,11 +357,9 @@ class SignalSampler(TreeSampler):
         if slots.numel() == 0:
             return 0
         slots = slots.to(table.device)
-        rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
-        stale = 0 if live is None else live.numel() - slots.numel()
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
-        table.fill_learned(rows, signals, live, sizes)
-        table.check_fused(rows)
+        rows, slots, live, sizes = table.learned_rows(slots, signals, written_at, batches)
+        stale = 0 if live is None else live.numel() - slots.numel()
         if slots.numel() == 0:
             return stale
         # One group of all batches where that is allowed, else a group for each batch.
@@ -405,7 +408,7 @@ class SignalSampler(TreeSampler):
                 facts = replace(facts, counted=weighing.counted[place])
             name = f"priorities of {type(adjust).__name__}"
             priority = check_shape(name, adjust(priority, facts), slots.shape)
-        return priority.to(torch.double).reshape(-1)
+        return priority.double().reshape(-1) if batches > 1 else priority.double()
 
     def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from typing import Any, Literal
@@ -21,7 +22,7 @@ from torchrl_mpfa.checks import (
     check_not_negative,
     check_shape,
 )
-from torchrl_mpfa.native import address, find_loops, loops, opaque
+from torchrl_mpfa.native import address, find_loops, is_plain, loops, opaque
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
@@ -133,6 +134,8 @@ class SignalTable:
             KeyError: If ``whole`` and an entry is missing.
             ValueError: If one is no finite number for each transition, or a signal is negative.
         """
+        if (rows := self._described(data, count)) is not None:
+            return rows
         reward = self._column(data, self.reward_key, "reward", count)
         rows = self.blank(count, "cpu" if reward is None else reward.device)
         for signal in self.written:
@@ -147,6 +150,92 @@ class SignalTable:
         elif whole:
             raise KeyError(_LACKS.format("reward", self.reward_key))
         return rows
+
+    @opaque
+    def _described(self, data: Any, count: int) -> Tensor | None:
+        """Return rows for new transitions by a loop; None where PyTorch has to, or finds fault."""
+        if not self._by_c:
+            return None
+        reward = data.get(self.reward_key, None)
+        numbers = [(reward, self.reward_column)]
+        for signal in self.written:
+            same = signal.key == self.reward_key
+            value = reward if same else data.get(signal.key, None)
+            if not isinstance(value, Tensor) or not _is_number(value, count):
+                return None
+            numbers.append(
+                (_priority(signal, value.detach().reshape(count)), self.column[signal.name])
+            )
+        sources = array("q")
+        for first, (value, column) in enumerate(numbers):
+            if not isinstance(value, Tensor) or not _is_number(value, count):
+                return None
+            sources.extend((value.data_ptr(), value.dtype.itemsize, column, first == 0))
+        columns = torch.empty((self.rows.shape[1], count), dtype=torch.double, device="cpu")
+        place = sources.buffer_info()[0], len(numbers), *columns.shape, columns.data_ptr()
+        return None if loops().describe(*place) else columns.T
+
+    def learned_rows(
+        self,
+        slots: Tensor,
+        signals: Mapping[str, Tensor],
+        written_at: Tensor | None,
+        batches: int,
+    ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
+        """Return copies of live rows with new learned signals, and as :meth:`_live_rows`.
+
+        Raises:
+            KeyError: If a signal is missing.
+            IndexError: If a slot is not filled.
+            ValueError: If a signal is negative, not finite or of another shape, or the slots are
+                not so many equal batches.
+        """
+        if (rows := self._joined(slots, signals, written_at, batches)) is not None:
+            return rows, slots, None, [slots.numel() // batches] * batches
+        rows, slots, live, sizes = self._live_rows(slots, written_at, batches)
+        self.fill_learned(rows, signals, live, sizes)
+        self._check_fused(rows)
+        return rows, slots, live, sizes
+
+    @opaque
+    def _joined(
+        self,
+        slots: Tensor,
+        signals: Mapping[str, Tensor],
+        written_at: Tensor | None,
+        batches: int,
+    ) -> Tensor | None:
+        """Return the rows by one loop; None where PyTorch has to, or finds fault."""
+        count, numbers = slots.numel(), array("q")
+        if not self._by_c or type(batches) is not int or batches < 1 or count % batches:
+            return None
+        for signal in self.learned:
+            value = signals.get(signal.name)
+            if value is None or signal.priority or not _fits(value, torch.float, count):
+                return None
+            numbers.append(value.data_ptr())
+        if written_at is not None and not _fits(written_at, torch.double, count):
+            return None
+        slots = slots.contiguous()
+        rows = torch.empty((self.rows.shape[1], count), dtype=torch.double, device="cpu")
+        wrong = loops().join(
+            self.rows.data_ptr(),
+            self.rows.shape[1],
+            address(slots, torch.long),
+            count,
+            min(self._reachable(written_at), self.capacity),
+            None if written_at is None else written_at.data_ptr(),
+            numbers.buffer_info()[0],
+            len(numbers),
+            self.fused.stop,
+            rows.data_ptr(),
+        )
+        return None if wrong else rows.T
+
+    def _reachable(self, written_at: Tensor | None) -> int:
+        """Return the slots that a batch may be of."""
+        # A batch from before the table was cleared is stale, as its times of writing show.
+        return self.size if written_at is None else max(self.size, self.cleared)
 
     def fill_learned(
         self, rows: Tensor, signals: Mapping[str, Tensor], live: Tensor | None, sizes: Sequence[int]
@@ -167,7 +256,7 @@ class SignalTable:
                 if len(one):
                     into.copy_(_priority(signal, one))
 
-    def check_fused(self, rows: Tensor) -> None:
+    def _check_fused(self, rows: Tensor) -> None:
         """Reject rows whose signals cannot be fused: missing, negative or not finite."""
         if rows.numel() == 0:
             return
@@ -182,25 +271,19 @@ class SignalTable:
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_not_negative(f"signal {name!r}", value)
 
-    def live_rows(
+    def _live_rows(
         self, slots: Tensor, written_at: Tensor | None, batches: int
     ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
         """Return live rows and slots, the mask of live ones, and the sizes of batches."""
-        # A batch from before the table was cleared is stale, as its times of writing show.
-        filled = self.size if written_at is None else max(self.size, self.cleared)
+        filled = self._reachable(written_at)
         if type(batches) is not int or batches < 1:
             check_counts(batches=batches)
         count = slots.numel()
         if count % batches:
             raise ValueError(f"{count} slots cannot make {batches} equal batches")
-        rows, sizes = (
-            self._taken(slots, 0, self.rows.shape[1], filled),
-            [count // batches] * batches,
-        )
-        if rows is None:
-            if check_index(slots, filled).numel() < count:
-                raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-            rows = self.rows.index_select(0, slots)
+        if check_index(slots, filled).numel() < count:
+            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
+        rows, sizes = self.rows.index_select(0, slots), [count // batches] * batches
         if written_at is None:
             return rows, slots, None, sizes
         if written_at.numel() != count:
@@ -244,6 +327,7 @@ class SignalTable:
         # With its sign, which says whether a reward is positive.
         return of_agents.gather(1, of_agents.abs().argmax(1, keepdim=True)).squeeze(1)
 
+    @opaque
     def write(self, index: Tensor, rows: Tensor) -> None:
         """Write new transitions in their slots, and reset all else of these slots."""
         count = len(rows)
@@ -253,12 +337,15 @@ class SignalTable:
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
         index, rows = index.to(self.device), rows.to(self.device)
-        if count == 1:
-            rows[0, self.time_column] = self.writes
+        if self._by_c:
+            columns, index = rows.T.contiguous(), index.contiguous()
+            batch = address(index, torch.long), count, self.capacity, columns.data_ptr()
+            width = self.rows.shape[1]
+            loops().give(self.rows.data_ptr(), width, width - 1, *batch, self.writes)
         else:
             times = torch.arange(self.writes, self.writes + count, device=self.device)
             rows[:, self.time_column] = times
-        self.rows[index] = rows
+            self.rows[index] = rows
         self.writes += count
 
     @property
@@ -267,30 +354,16 @@ class SignalTable:
         return self.rows.is_cpu and find_loops() is not None
 
     @opaque
-    def _taken(self, slots: Tensor, first: int, count: int, filled: int) -> Tensor | None:
-        """Return so many columns of slots, shape ``[B, count]``; each lies in one piece.
-
-        None where PyTorch has to take them, or a slot is not filled.
-        """
-        if not self._by_c:
-            return None
-        slots = slots.contiguous()
-        columns = torch.empty((count, slots.numel()), dtype=torch.double, device="cpu")
-        batch = address(slots, torch.long), slots.numel(), min(filled, self.capacity)
-        place = self.rows.data_ptr(), self.rows.shape[1], first, count
-        return None if loops().take(*place, *batch, columns.data_ptr()) else columns.T
-
-    @opaque
     def learn(self, slots: Tensor, rows: Tensor) -> None:
-        """Write the learned signals of rows of :meth:`live_rows`; the last of a slot counts."""
-        learned = rows[:, : len(self.learned)]
+        """Write the learned signals of rows of :meth:`_live_rows`; the last of a slot counts."""
+        count = len(self.learned)
         if self._by_c:
-            columns, slots = learned.T.contiguous(), slots.contiguous()
+            columns, slots = rows.T.contiguous(), slots.contiguous()
             batch = address(slots, torch.long), slots.numel(), self.capacity
-            place = self.rows.data_ptr(), self.rows.shape[1], len(self.learned)
-            loops().give(*place, *batch, columns.data_ptr())
+            place = self.rows.data_ptr(), self.rows.shape[1], count
+            loops().give(*place, *batch, columns.data_ptr(), -1)
         else:
-            self.rows[:, : len(self.learned)].index_copy_(0, slots, learned)
+            self.rows[:, :count].index_copy_(0, slots, rows[:, :count])
 
     @opaque
     def count_replay(self, index: Tensor) -> None:
@@ -304,10 +377,7 @@ class SignalTable:
 
     def written_at(self, index: Tensor) -> Tensor:
         """Return the time of writing of each slot, a count of writes, shape ``[B]``."""
-        times = self._taken(index, self.time_column, 1, self.capacity)
-        if times is None:
-            return self.rows.select(1, self.time_column).index_select(0, index)
-        return times.squeeze(1)
+        return self.rows.select(1, self.time_column).index_select(0, index)
 
     def replay_counts(self, index: Tensor) -> Tensor:
         """Return the replays of each slot, shape ``[B]``."""
@@ -346,6 +416,16 @@ class SignalTable:
         table.rows[: len(rows)] = rows.to(device)
         table.size, table.writes, table.loaded = state["size"], state["writes"], state["writes"]
         return table
+
+
+def _fits(value: Tensor, dtype: torch.dtype, count: int) -> bool:
+    """Return True if a tensor has so many numbers of a type for C."""
+    return value.dtype is dtype and value.numel() == count and is_plain(value)
+
+
+def _is_number(value: Tensor, count: int) -> bool:
+    """Return True if a tensor has one number for each transition, as C reads them."""
+    return value.dtype in (torch.float, torch.double) and _fits(value, value.dtype, count)
 
 
 def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, ...]]:

@@ -48,6 +48,10 @@ class Fusing(Protocol):
         """Reward above which a transition is positive."""
 
     @property
+    def recounts(self) -> bool:
+        """True if fusion or adjustments count at each update, or may have to."""
+
+    @property
     def entropy_refresh(self) -> float:
         """Share of the buffer that may be rewritten before weights are counted again."""
 
@@ -131,6 +135,8 @@ def weigh(sampler: Fusing, index: Tensor, last: Weighing | None) -> Weighing:
     weighing = last or Weighing()
     changed = table.writes - weighing.writes
     due = last is None or refresh == 0 or not 0 <= changed <= refresh * table.size
+    if not (due or sampler.recounts):
+        return weighing
     if due or sampler.fusion.every_batch:
         names = table.names[table.fused]
         weighing = replace(weighing, weights=checked_weights(sampler.fusion, names, table, index))
