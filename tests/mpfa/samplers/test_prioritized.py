@@ -21,6 +21,8 @@ from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.samplers import TreeSampler
 
+pytestmark = pytest.mark.usefixtures("path")
+
 
 def filled(sampler, count, capacity):
     """A storage with so many rows, marked in the sampler as TorchRL's buffer does."""
