@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from typing import Any, Literal
@@ -22,7 +21,7 @@ from torchrl_mpfa.checks import (
     check_not_negative,
     check_shape,
 )
-from torchrl_mpfa.native import address, find_loops, is_plain, loops, opaque
+from torchrl_mpfa.native.tables import describe, fits, give, has_loops, join, tally
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
@@ -151,29 +150,20 @@ class SignalTable:
             raise KeyError(_LACKS.format("reward", self.reward_key))
         return rows
 
-    @opaque
     def _described(self, data: Any, count: int) -> Tensor | None:
         """Return rows for new transitions by a loop; None where PyTorch has to, or finds fault."""
-        if not self._by_c:
+        if not has_loops(self.rows):
             return None
         reward = data.get(self.reward_key, None)
         numbers = [(reward, self.reward_column)]
         for signal in self.written:
             same = signal.key == self.reward_key
             value = reward if same else data.get(signal.key, None)
-            if not isinstance(value, Tensor) or not _is_number(value, count):
+            if not fits(value, count, torch.float, torch.double):
                 return None
-            numbers.append(
-                (_priority(signal, value.detach().reshape(count)), self.column[signal.name])
-            )
-        sources = array("q")
-        for first, (value, column) in enumerate(numbers):
-            if not isinstance(value, Tensor) or not _is_number(value, count):
-                return None
-            sources.extend((value.data_ptr(), value.dtype.itemsize, column, first == 0))
-        columns = torch.empty((self.rows.shape[1], count), dtype=torch.double, device="cpu")
-        place = sources.buffer_info()[0], len(numbers), *columns.shape, columns.data_ptr()
-        return None if loops().describe(*place) else columns.T
+            priority = _priority(signal, value.detach().reshape(count))
+            numbers.append((priority, self.column[signal.name]))
+        return describe(self.rows, numbers, count)
 
     def learned_rows(
         self,
@@ -190,47 +180,17 @@ class SignalTable:
             ValueError: If a signal is negative, not finite or of another shape, or the slots are
                 not so many equal batches.
         """
-        if (rows := self._joined(slots, signals, written_at, batches)) is not None:
-            return rows, slots, None, [slots.numel() // batches] * batches
+        new = [signals.get(s.name) for s in self.learned if s.priority is None]
+        equal = type(batches) is int and batches > 0 and slots.numel() % batches == 0
+        if equal and len(new) == len(self.learned) and has_loops(self.rows):
+            end = self._reachable(written_at)
+            rows = join(self.rows, slots, new, written_at, end, self.fused.stop)
+            if rows is not None:
+                return rows, slots, None, [slots.numel() // batches] * batches
         rows, slots, live, sizes = self._live_rows(slots, written_at, batches)
         self.fill_learned(rows, signals, live, sizes)
         self._check_fused(rows)
         return rows, slots, live, sizes
-
-    @opaque
-    def _joined(
-        self,
-        slots: Tensor,
-        signals: Mapping[str, Tensor],
-        written_at: Tensor | None,
-        batches: int,
-    ) -> Tensor | None:
-        """Return the rows by one loop; None where PyTorch has to, or finds fault."""
-        count, numbers = slots.numel(), array("q")
-        if not self._by_c or type(batches) is not int or batches < 1 or count % batches:
-            return None
-        for signal in self.learned:
-            value = signals.get(signal.name)
-            if value is None or signal.priority or not _fits(value, torch.float, count):
-                return None
-            numbers.append(value.data_ptr())
-        if written_at is not None and not _fits(written_at, torch.double, count):
-            return None
-        slots = slots.contiguous()
-        rows = torch.empty((self.rows.shape[1], count), dtype=torch.double, device="cpu")
-        wrong = loops().join(
-            self.rows.data_ptr(),
-            self.rows.shape[1],
-            address(slots, torch.long),
-            count,
-            min(self._reachable(written_at), self.capacity),
-            None if written_at is None else written_at.data_ptr(),
-            numbers.buffer_info()[0],
-            len(numbers),
-            self.fused.stop,
-            rows.data_ptr(),
-        )
-        return None if wrong else rows.T
 
     def _reachable(self, written_at: Tensor | None) -> int:
         """Return the slots that a batch may be of."""
@@ -327,7 +287,6 @@ class SignalTable:
         # With its sign, which says whether a reward is positive.
         return of_agents.gather(1, of_agents.abs().argmax(1, keepdim=True)).squeeze(1)
 
-    @opaque
     def write(self, index: Tensor, rows: Tensor) -> None:
         """Write new transitions in their slots, and reset all else of these slots."""
         count = len(rows)
@@ -337,40 +296,26 @@ class SignalTable:
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
         index, rows = index.to(self.device), rows.to(self.device)
-        if self._by_c:
-            columns, index = rows.T.contiguous(), index.contiguous()
-            batch = address(index, torch.long), count, self.capacity, columns.data_ptr()
-            width = self.rows.shape[1]
-            loops().give(self.rows.data_ptr(), width, width - 1, *batch, self.writes)
+        if has_loops(self.rows):
+            give(self.rows, index, rows, self.rows.shape[1] - 1, time=self.writes)
         else:
             times = torch.arange(self.writes, self.writes + count, device=self.device)
             rows[:, self.time_column] = times
             self.rows[index] = rows
         self.writes += count
 
-    @property
-    def _by_c(self) -> bool:
-        """True if compiled loops read and write the rows."""
-        return self.rows.is_cpu and find_loops() is not None
-
-    @opaque
     def learn(self, slots: Tensor, rows: Tensor) -> None:
         """Write the learned signals of rows of :meth:`_live_rows`; the last of a slot counts."""
         count = len(self.learned)
-        if self._by_c:
-            columns, slots = rows.T.contiguous(), slots.contiguous()
-            batch = address(slots, torch.long), slots.numel(), self.capacity
-            place = self.rows.data_ptr(), self.rows.shape[1], count
-            loops().give(*place, *batch, columns.data_ptr(), -1)
+        if has_loops(self.rows):
+            give(self.rows, slots, rows, count)
         else:
             self.rows[:, :count].index_copy_(0, slots, rows[:, :count])
 
-    @opaque
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
-        if self._by_c:
-            place = self.rows.data_ptr(), self.rows.shape[1], self.count_column
-            loops().tally(*place, address(index, torch.long), index.numel())
+        if has_loops(self.rows):
+            tally(self.rows, self.count_column, index)
         else:
             one = torch.ones(len(index), dtype=torch.double, device=self.device)
             self.rows.select(1, self.count_column).index_add_(0, index, one)
@@ -416,16 +361,6 @@ class SignalTable:
         table.rows[: len(rows)] = rows.to(device)
         table.size, table.writes, table.loaded = state["size"], state["writes"], state["writes"]
         return table
-
-
-def _fits(value: Tensor, dtype: torch.dtype, count: int) -> bool:
-    """Return True if a tensor has so many numbers of a type for C."""
-    return value.dtype is dtype and value.numel() == count and is_plain(value)
-
-
-def _is_number(value: Tensor, count: int) -> bool:
-    """Return True if a tensor has one number for each transition, as C reads them."""
-    return value.dtype in (torch.float, torch.double) and _fits(value, value.dtype, count)
 
 
 def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, ...]]:
