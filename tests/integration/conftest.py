@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -10,6 +11,7 @@ import pytest
 import torch
 from hydra.core.config_store import ConfigStore
 
+from training import pictures
 from training.records import write_table
 from training.settings.train import register
 
@@ -21,6 +23,14 @@ def one_store() -> Iterator[None]:
         # What is loaded from the store is a copy in any case.
         patch.setattr(ConfigStore, "__deepcopy__", lambda store, _: store, raising=False)
         register()
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_films() -> Iterator[None]:
+    """Film an episode in nine pictures: a hundred of them take longer than all else of a run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pictures, "film_episode", partial(pictures.film_episode, most=8))
         yield
 
 
