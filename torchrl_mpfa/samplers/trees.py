@@ -210,6 +210,42 @@ class PlainTrees:
         return -self._highs.query(0, self._size)
 
 
+class ReadTree:
+    """The tree of sums or of minima, as far as TorchRL reads it.
+
+    Args:
+        trees: Trees of all kinds.
+        minimum: True for that of minima.
+    """
+
+    def __init__(self, trees: CompiledTrees | PlainTrees, *, minimum: bool) -> None:
+        self._trees, self._minimum = trees, minimum
+
+    def __getitem__(self, slots: Any) -> Tensor:
+        leaves = self._trees.leaves(torch.as_tensor(slots).reshape(-1))
+        return leaves.where(~leaves.signbit(), _MOST) if self._minimum else leaves
+
+    def query(self, start: int, end: int) -> Any:
+        """Return the sum or minimum of the leaves from ``start``, which is 0, to before ``end``."""
+        if start:
+            raise ValueError(f"start must be 0, got {start}: sum up the leaves of the slots")
+        return self._trees.lowest(end) if self._minimum else self._trees.sum(end)
+
+
+class HasTrees:
+    """A sampler that has trees, which TorchRL's methods find by their own names."""
+
+    trees: Any
+
+    @property
+    def _sum_tree(self) -> ReadTree:
+        return ReadTree(self.trees, minimum=False)
+
+    @property
+    def _min_tree(self) -> ReadTree:
+        return ReadTree(self.trees, minimum=True)
+
+
 def is_learned(priorities: Tensor) -> Tensor:
     """Return True where a priority was learned, shape ``[B]``."""
     return (priorities >= 0) & ~priorities.signbit()

@@ -97,7 +97,7 @@ def test_a_number_that_is_not_finite_is_rejected_and_nothing_written(number, dty
     with pytest.raises(ValueError, match="'further' must be finite"):
         buffer.extend(wrong)
     assert buffer.writer._cursor == len(buffer) == 4
-    assert torch.equal(before["_sampler"]["_leaves"], buffer.sampler.state_dict()["_leaves"])
+    assert torch.equal(before["_sampler"]["_sum_tree"], buffer.sampler.state_dict()["_sum_tree"])
 
 
 def test_a_storage_larger_than_its_sampler_samples_no_slot_outside_of_it(monkeypatch):
@@ -151,7 +151,7 @@ def test_several_threads_write_and_sample_one_buffer(monkeypatch):
     for thread in threads:
         thread.join()
     sampler = buffer.sampler
-    leaves = sampler.state_dict()["_leaves"]
+    leaves = sampler.state_dict()["_sum_tree"]
     assert sampler.trees.sum(64) == pytest.approx(float(leaves.sum()), rel=1e-12)
     assert sampler.table.writes == 64 + 3 * 40 * 5
 
