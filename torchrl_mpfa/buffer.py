@@ -23,7 +23,7 @@ from torchrl_mpfa.samplers.composition import distributions
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.saving import check_saved, dump, open_dump
-from torchrl_mpfa.storages.schema import as_integers, as_path
+from torchrl_mpfa.storages.entries import as_path
 from torchrl_mpfa.storages.states import load_part, state_of
 from torchrl_mpfa.storages.tensor import rows_with
 from torchrl_mpfa.writes import REWARD_KEY, CheckedReplayBuffer
@@ -260,8 +260,6 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
-        if self._storage.ndim == 1 and (index := as_integers(index)).ndim != 1:
-            index = index.reshape(-1)
         signals: dict[str, Tensor] = {}
         for signal in self._sampler.signals:
             if signal.known_at == "update":
@@ -281,7 +279,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         self._unreturned = 0
 
     def anneal(self, beta: float, fraction: float) -> None:
-        """Set beta, and the weights of a fusion that changes; no effect without priorities.
+        """Set beta, and the weights of a fusion that changes; nothing where no signals are fused.
 
         Args:
             beta: Exponent of the importance weights, Eq. (10).
@@ -296,8 +294,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         """Return the rewards of all transitions, shape ``[N]``."""
         if self._fuses:
             with self._replay_lock, self._write_lock:
-                rewards: Tensor = self._sampler.table.rewards
-            return rewards
+                return self._sampler.table.rewards
         return self[:][REWARD_KEY].reshape(len(self)).double()
 
     def distributions(self) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.entries import as_path
 
 if TYPE_CHECKING:
     # The samplers import this module.

@@ -20,7 +20,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl_mpfa.checks import as_mask
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
-from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.entries import as_path
 
 PAL = "pal"
 DISTANCES = ("l1", "l2", "smooth_l1", PAL)
@@ -112,8 +112,7 @@ def distance(
         error = (target - value) / unit
         bent = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         return bent * unit**2
-    loss: Tensor = distance_loss(value, target, loss_function)
-    return loss
+    return distance_loss(value, target, loss_function)
 
 
 def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:

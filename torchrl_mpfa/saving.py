@@ -67,14 +67,11 @@ def write_text_atomically(text: str, path: str | Path) -> None:
         file.write(text.encode())
 
 
-def load_safely(
-    path: str | Path, *, map_location: str | torch.device = "cpu", mmap: bool = False
-) -> Any:
+def load_safely(path: str | Path, *, mmap: bool = False) -> Any:
     """Read a file of tensors and plain values without executing anything in it.
 
     Args:
         path: The file.
-        map_location: Device of the tensors.
         mmap: True to leave tensors in the file until they are read.
 
     Returns:
@@ -87,7 +84,7 @@ def load_safely(
     """
     _check_seal(Path(path))
     try:
-        return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except pickle.UnpicklingError as error:
         raise pickle.UnpicklingError(
             f"{path} holds more than tensors and plain values: {error}"
@@ -206,17 +203,13 @@ def _check_seal(path: Path) -> None:
 
 
 def _hex(file: IO[bytes], end: int) -> bytes:
-    return f"{checksum_of(file, end):08x}".encode()
-
-
-def checksum_of(file: IO[bytes], end: int) -> int:
-    """CRC-32 of the first ``end`` bytes of a file."""
+    """CRC-32 of the first ``end`` bytes of a file, as text."""
     file.seek(0)
     checksum = 0
     while end > 0 and (chunk := file.read(min(end, 1 << 20))):
         checksum = zlib.crc32(chunk, checksum)
         end -= len(chunk)
-    return checksum
+    return f"{checksum:08x}".encode()
 
 
 @contextmanager

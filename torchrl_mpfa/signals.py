@@ -62,6 +62,8 @@ REWARD = Signal("reward", key=("next", "reward"), known_at="write", priority=rew
 TD_ERROR = Signal("td_error")
 ACTION_GRADIENT = Signal("action_gradient")
 
+OF_LEARNERS = ("td_error", "action_gradient", "value", "information_gain")
+"""Names of the signals that an :class:`~torchrl_mpfa.ActorCritic` can write."""
 MPFA_SIGNALS: tuple[Signal, ...] = (REWARD, TD_ERROR, ACTION_GRADIENT)
 """The three signals of Eqs. (12)-(14)."""
 

@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_leaves
 from torchrl.envs.transforms import Compose, MultiStepTransform, Transform
 
 from torchrl_mpfa.checks import as_mask
-from torchrl_mpfa.storages.schema import as_path, check_finite_entries
+from torchrl_mpfa.storages.entries import as_path, check_finite_entries
 
 _AT_A_WRITE = ("inv", "_inv_call", "_inv_apply_transform")
 _OF_EVERY_MODULE = {*vars(nn.Module())}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from multiprocessing.context import get_spawning_popen
 from typing import Any, NoReturn, TypeVar
 
@@ -20,7 +20,7 @@ from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.sharing import SharedWrites, WriterSampler, check_shared
 from torchrl_mpfa.storages.plan import NewRows, RowPlan
-from torchrl_mpfa.storages.schema import as_path, check_finite_entries
+from torchrl_mpfa.storages.entries import as_path, check_finite_entries
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
 
@@ -67,14 +67,13 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         by_priority = isinstance(self._sampler, PrioritizedSampler)
         return {**state, "_sampler": WriterSampler(by_priority=by_priority)} if keeps else state
 
-    def _checks(self, data: Any) -> bool:
+    def _is_checked(self, data: Any) -> bool:
         # The property, not the attribute: with delayed_init the parts are made at their first use.
         sampler = self.sampler
-        has_signals = isinstance(sampler, SignalSampler | WriterSampler) or isinstance(
-            self._storage, SignalTensorStorage
-        )
+        signals = isinstance(sampler, SignalSampler | WriterSampler)
+        ours = signals or isinstance(self._storage, SignalTensorStorage)
         consumes = isinstance(sampler, ConsumingSampler)
-        return has_signals and not consumes and isinstance(data, TensorDictBase)
+        return ours and not consumes and isinstance(data, TensorDictBase)
 
     @opaque
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
@@ -95,7 +94,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
                 finite, a first priority cannot be or comes in another process, there is no batch
                 size, or padding cannot be left out; nothing is changed, in the transforms neither.
         """
-        if not self._checks(tensordicts):
+        if not self._is_checked(tensordicts):
             return super().extend(tensordicts, update_priority=update_priority)
         if tensordicts.ndim < self._storage.ndim:
             raise ValueError(
@@ -107,13 +106,12 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         with (
             torch.inference_mode(False),
             torch.no_grad(),
-            self._transformed(tensordicts) as data,
+            # Asked first, as even an empty list of transforms takes its time.
+            self._memory.transformed(tensordicts)
+            if len(self._transform)
+            else nullcontext(tensordicts) as data,
         ):
             return self._extend_checked(data, update_priority is not False)
-
-    def _transformed(self, data: TensorDictBase) -> AbstractContextManager[TensorDictBase | None]:
-        """Return the context in which transitions are as the transforms make them."""
-        return self._memory.transformed(data) if len(self._transform) else nullcontext(data)
 
     def _without_padding(self, data: TensorDictBase) -> TensorDictBase:
         """Leave out rows that a mask of padded trajectories marks, as ``split_trajs`` makes it."""
@@ -178,22 +176,22 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _write(self, data: TensorDictBase) -> Tensor:
         if self.dim_extend > 0:
             data = self._transpose(data)
-        planned, rows = self._check(data)
+        new, of_table = self._prepare(data)
         writer = self._writer
         in_a_ring = isinstance(writer, RoundRobinWriter)
         place = (writer._cursor, writer._write_count) if in_a_ring else None
         # The sampler gets the rows that were checked. Another writer may keep some of them only.
-        if in_a_ring and rows is not None and self._storage.ndim == 1:
-            self._sampler.take_rows(rows)
+        if in_a_ring and of_table is not None and self._storage.ndim == 1:
+            self._sampler.take_rows(of_table)
         try:
-            if planned is not None:
-                index = self._write_in_turn(planned)
+            if new is not None:
+                index = self._write_in_turn(new)
             else:
                 # The writer calls mark_update of this buffer, which calls that of the sampler. It
                 # adds the slots, which the caller's data shall not get.
                 index = writer.extend(data.copy())
         except BaseException:
-            if rows is not None:
+            if of_table is not None:
                 self._sampler.take_rows(None)
             if place is not None:
                 # The writer advances before the storage has the data.
@@ -206,18 +204,20 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _write_in_turn(self, rows: NewRows) -> Tensor:
         """Write rows that fit the storage in the next slots, as TorchRL's writer does."""
         storage, writer, count = self._storage, self._writer, len(rows)
-        start = writer._cursor
-        index = torch.arange(start, start + count, device="cpu")
-        if start + count > storage.max_size:
-            index %= storage.max_size
+        index = self._next_slots(count)
         rows.write(index, storage.max_size)
-        writer._cursor = (start + count) % storage.max_size
+        writer._cursor = (writer._cursor + count) % storage.max_size
         writer._write_count += count
         storage.note_written(index)
         self._sampler.mark_update(index, storage=storage)
         return index
 
-    def _check(self, data: TensorDictBase) -> tuple[NewRows | None, Tensor | None]:
+    def _next_slots(self, count: int) -> Tensor:
+        """Return the slots in which so many rows come in turn, shape ``[B]``."""
+        start = self._writer._cursor
+        return torch.arange(start, start + count, device="cpu") % self._storage.max_size
+
+    def _prepare(self, data: TensorDictBase) -> tuple[NewRows | None, Tensor | None]:
         """Check transitions in the order of their slots.
 
         Returns:
@@ -230,20 +230,24 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         """
         lead = min(self._storage.ndim, data.ndim)
         self._check_width(data)
-        plan, planned = self._row_plan(), None
+        plan, new = self._row_plan(), None
         if plan is None:
             check_finite_entries(data, lead, self._allow_nonfinite)
-        elif not (self._writes_in_turn() and (planned := plan.match(data, with_index=False))):
-            plan.check(data, lead)
-        if isinstance(self._sampler, SignalSampler):
-            return planned, self._sampler.check_new(data, data.shape[:lead].numel())
-        return None, None
+        else:
+            if self._writes_in_turn():
+                new = plan.match(data, self._next_slots(len(data)))
+            if new is None:
+                plan.check(data, lead)
+        fuses = isinstance(self._sampler, SignalSampler)
+        return new, self._sampler.check_new(data, data.shape[:lead].numel()) if fuses else None
 
     def _row_plan(self) -> RowPlan | None:
         """Return the plan of the stored rows; None before the first write."""
         stored = getattr(self._storage, "_storage", None)
         # What an empty storage was restored from is a tensordict without entries.
-        if not getattr(self._storage, "initialized", False) or not _is_plain(stored):
+        if not (getattr(self._storage, "initialized", False) and isinstance(stored, TensorDict)):
+            return None
+        if len(stored.keys()) == 0:
             return None
         if self._plan is None or not self._plan.describes(stored):
             self._plan = RowPlan(stored, self._storage.ndim, self._allow_nonfinite)
@@ -289,7 +293,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             KeyError: See :meth:`extend`.
             ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
         """
-        if not self._checks(data):
+        if not self._is_checked(data):
             return super().add(data)
         if data.ndim < self.dim_extend:
             raise ValueError(
@@ -306,8 +310,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         self._check_owned()
         if isinstance(index, str | tuple):
             self._write_in_place()
-        if self._checks(value):
-            self._check(value if value.ndim else value.unsqueeze(0))
+        if self._is_checked(value):
+            self._prepare(value if value.ndim else value.unsqueeze(0))
         super().__setitem__(index, value)
         self._clock[0] += 1
         # A storage of this package says so itself, whoever writes in it.
@@ -364,8 +368,3 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
             self._clear_prefetch_queue_locked()
         with self._write_lock:
             pass
-
-
-def _is_plain(stored: Any) -> bool:
-    """Return True if a storage holds a tensordict with entries."""
-    return isinstance(stored, TensorDict) and len(stored.keys()) > 0

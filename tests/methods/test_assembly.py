@@ -21,6 +21,12 @@ from torchrl_mpfa.methods import (
 NAN = float("nan")
 
 
+def test_learner_is_not_asked_for_a_signal_of_one_s_own():
+    mine = Scaled("mine", signals=["td_error", "novelty"])
+    assert make_replay(mine).signals == ("novelty", "td_error")
+    assert loss_options(mine)["signals"] == ["td_error"]
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
     replay = make_replay(

@@ -52,7 +52,7 @@ COMMON = [
     *[
         (name, MISSING, f"'{name}' is missing in the saved sampler")
         for name in (
-            *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_highest_slot", "_kind"),
+            *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_kind"),
             *("_format", "_priorities", "_learned", "_sum_tree", "_signals"),
             *("_weights", "_weighed_at", "_mean_reward"),
         )

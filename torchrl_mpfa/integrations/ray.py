@@ -83,13 +83,11 @@ class RaySignalReplayBuffer(RayReplayBuffer):
 
     def rewards(self) -> torch.Tensor:
         """Rewards of all transitions, shape ``[N]``."""
-        rewards: torch.Tensor = self._client.rewards()
-        return rewards
+        return self._client.rewards()
 
     def distributions(self) -> dict[str, torch.Tensor]:
         """See :meth:`SignalReplayBuffer.distributions`."""
-        columns: dict[str, torch.Tensor] = self._client.distributions()
-        return columns
+        return self._client.distributions()
 
     def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """See :meth:`SignalReplayBuffer.update_tensordict_priority`."""

@@ -71,7 +71,11 @@ class PriorityStepper(OptimizationStepper):
             ValueError: If the trainer has no replay buffer.
             KeyError: If the loss did not write a signal that the sampler needs.
         """
-        replay_buffer = buffer_of(trainer)
+        replay_buffer = getattr(trainer, "replay_buffer", None)
+        if replay_buffer is None:
+            raise ValueError(
+                f"replay_buffer of the trainer must not be None, got {kind_of(trainer)}"
+            )
         metrics = self.stepper.step(_WithoutPriorities(trainer), sub_batch)
         if sub_batch.get(TD_ERROR.key, None) is None and isinstance(trainer.loss_module, SUPPORTED):
             write_signals(sub_batch, trainer.loss_module)
@@ -90,20 +94,11 @@ class PriorityStepper(OptimizationStepper):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the inner stepper."""
-        state: dict[str, Any] = self.stepper.state_dict()
-        return state
+        return self.stepper.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the state of the inner stepper."""
         self.stepper.load_state_dict(state_dict)
-
-
-def buffer_of(trainer: Trainer) -> Any:
-    """Return the replay buffer of a trainer, which must have one."""
-    replay_buffer = getattr(trainer, "replay_buffer", None)
-    if replay_buffer is None:
-        raise ValueError(f"replay_buffer of the trainer must not be None, got {kind_of(trainer)}")
-    return replay_buffer
 
 
 class _WithoutPriorities:

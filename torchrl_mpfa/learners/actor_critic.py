@@ -48,10 +48,8 @@ from torchrl_mpfa.priorities import (
     td_error_priority,
 )
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import SIGNALS_KEY
+from torchrl_mpfa.signals import OF_LEARNERS, SIGNALS_KEY
 
-KNOWN_SIGNALS = ("td_error", "action_gradient", "value", "information_gain")
-"""Signals that the learner can write."""
 _LEAST_SLOPE = 1e-19
 """Its square is still a normal number in single precision."""
 
@@ -166,9 +164,9 @@ class ActorCritic(OptimizedLearner):
     ) -> None:
         check_networks(actor, critic)
         self.stochastic = isinstance(actor, ProbabilisticTensorDictSequential)
-        if unknown := [name for name in signals if name not in KNOWN_SIGNALS]:
+        if unknown := [name for name in signals if name not in OF_LEARNERS]:
             raise ValueError(
-                f"signals must be among {KNOWN_SIGNALS}, got {unknown}: write a signal of "
+                f"signals must be among {OF_LEARNERS}, got {unknown}: write a signal of "
                 "your own in the batch after update(...)"
             )
         self.signals = tuple(signals)

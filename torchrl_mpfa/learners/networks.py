@@ -32,8 +32,7 @@ class Called(nn.Module):
         """Compute the outputs without exploration; further inputs do no harm."""
         read = TensorDict({key: inputs[key] for key in self.network.in_keys})
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            outputs: Tensors = self.network(read)
-        return outputs
+            return self.network(read)
 
 
 def as_function(network: TensorDictModule) -> nn.Module:

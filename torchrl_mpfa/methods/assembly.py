@@ -14,8 +14,8 @@ from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.methods.base import Method
 from torchrl_mpfa.methods.catalogue import method_named
-from torchrl_mpfa.methods.registered import SIGNALS
 from torchrl_mpfa.selection import Selection
+from torchrl_mpfa.signals import OF_LEARNERS
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 
@@ -133,7 +133,7 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         method: A name, or a method of your own.
 
     Returns:
-        ``signals`` without the registered ones, ``importance``, ``loss_function`` and
+        ``signals``, of which your own are left out, ``importance``, ``loss_function`` and
         ``pal_alpha``, and those that the class of the method's learner has beyond these.
 
     Raises:
@@ -145,7 +145,7 @@ def loss_options(method: str | Method) -> dict[str, Any]:
     """
     chosen = method_named(method)
     return {
-        "signals": [name for name in learned_signals(chosen) if name not in SIGNALS],
+        "signals": [name for name in learned_signals(chosen) if name in OF_LEARNERS],
         "importance": chosen.importance,
         "loss_function": chosen.loss_function,
         "pal_alpha": chosen.pal_alpha,
@@ -154,6 +154,6 @@ def loss_options(method: str | Method) -> dict[str, Any]:
 
 
 def learned_signals(method: Method) -> list[str]:
-    """Return the entries that an update has to write for the signals of a method."""
+    """Return the last parts of the keys at which an update writes the signals of a method."""
     keys = [signal.key for signal in method.priority_signals() if signal.known_at == "update"]
     return sorted({key[-1] if isinstance(key, tuple) else key for key in keys})

@@ -11,12 +11,12 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchrl_mpfa.checks import COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, SHARE, Rule, keep, rules_of
+from torchrl_mpfa.fusion import FixedFusion, Fusion
 
 if TYPE_CHECKING:
     from torchrl.data import RandomSampler
 
     from torchrl_mpfa.adjustment import Adjustment
-    from torchrl_mpfa.fusion import Fusion
     from torchrl_mpfa.samplers.fused import SignalSampler
     from torchrl_mpfa.selection import Selection
     from torchrl_mpfa.signals import Signal
@@ -141,8 +141,7 @@ class Method:
 
     def sampler(self) -> SignalSampler | RandomSampler:
         """Make the sampler."""
-        sampler: SignalSampler | RandomSampler = resolve_name(self.kind)(**self.sampler_options())
-        return sampler
+        return resolve_name(self.kind)(**self.sampler_options())
 
     def selection(self, policy: Any, sigma: Any) -> Selection:
         """Make the function that samples the batches of one training step.
@@ -151,8 +150,7 @@ class Method:
             policy: The policy in training, which is there if :attr:`needs` names it.
             sigma: Standard deviation of its exploration noise, or a function that gives it.
         """
-        select: Selection = resolve_name(self.batches)
-        return select
+        return resolve_name(self.batches)
 
 
 @dataclass
@@ -192,15 +190,12 @@ class Prioritized(Method):
 
     def priority_signals(self) -> list[Signal]:
         """Return the signals of the priority; an unknown name is a signal of the loss."""
-        from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
+        from torchrl_mpfa.signals import as_signals
 
-        by_name = {signal.name: signal for signal in MPFA_SIGNALS}
-        return [by_name.get(name) or Signal(name) for name in self.signals]
+        return [*as_signals(self.signals)]
 
     def fusion(self) -> Fusion:
         """Make the fusion of the signals."""
-        from torchrl_mpfa.fusion import FixedFusion
-
         return FixedFusion(dict.fromkeys(self.signals, 1.0))
 
     def adjustments(self) -> list[Adjustment]:
@@ -209,7 +204,7 @@ class Prioritized(Method):
 
     def sampler(self) -> SignalSampler:
         """Make the sampler."""
-        sampler: SignalSampler = resolve_name(self.kind)(
+        return resolve_name(self.kind)(
             self.capacity,
             self.alpha,
             self.beta,
@@ -222,4 +217,3 @@ class Prioritized(Method):
             positive_above=self.positive_above,
             **self.sampler_options(),
         )
-        return sampler

@@ -7,14 +7,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from torchrl_mpfa.adjustment import Adjustment, Bound, Position, PositiveBoost, PositiveDecay
 from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, POSITIVE, SHARE, unknown
+from torchrl_mpfa.fusion import EntropyFusion, Fusion, ScaledFusion
 from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
+from torchrl_mpfa.methods.lap import LAPFloor
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.adjustment import Adjustment
-    from torchrl_mpfa.fusion import Fusion
     from torchrl_mpfa.selection import Selection
 
 
@@ -29,13 +30,13 @@ class Adjusted(Prioritized):
     boost_target: float = within(BELOW_ONE, 0.0)
     """Share of the total priority that positive transitions are to have, by a phi that follows how
     rare they are in the buffer; 0: phi is fixed."""
-    boost_bound: str = one_of("floor", "cap", "none")
+    boost_bound: Bound = one_of("floor", "cap", "none")
     """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
     decay: bool = within(SWITCH, False)
     """Decay positive transitions above the batch mean, Eqs. 23-24."""
     decay_sharpness: float = within(POSITIVE, 0.01)
     """sigma of Eq. 23."""
-    decay_position: str = one_of("batch", "rank", "count")
+    decay_position: Position = one_of("batch", "rank", "count")
     """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
     positive_above: Any = field(default=0.0, metadata={"rule": LEVEL})
     """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
@@ -43,22 +44,11 @@ class Adjusted(Prioritized):
 
     def adjustments(self) -> list[Adjustment]:
         """Make the boost and the decay that are on."""
-        from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
-
         parts: list[Adjustment] = []
         if self.boost:
-            boost = PositiveBoost(
-                boost=self.boost_factor,
-                bound=self.boost_bound,  # type: ignore[arg-type]
-                target_share=self.boost_target,
-            )
-            parts.append(boost)
+            parts.append(PositiveBoost(self.boost_factor, self.boost_bound, self.boost_target))
         if self.decay:
-            decay = PositiveDecay(
-                sharpness=self.decay_sharpness,
-                position=self.decay_position,  # type: ignore[arg-type]
-            )
-            parts.append(decay)
+            parts.append(PositiveDecay(self.decay_sharpness, self.decay_position))
         return parts
 
 
@@ -73,17 +63,12 @@ class MPFA(Adjusted):
     weight_floor: float = within(BELOW_ONE, 0.0)
     """Least weight of a signal: without one the reward alone counts until the first goal; 0: none,
     as in the paper."""
-    population: str = one_of("buffer", "batch")
+    population: Literal["buffer", "batch"] = one_of("buffer", "batch")
     """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
 
     def fusion(self) -> Fusion:
         """Make the fusion by entropy weights."""
-        from torchrl_mpfa.fusion import EntropyFusion
-
-        return EntropyFusion(
-            population=self.population,  # type: ignore[arg-type]
-            floor=self.weight_floor,
-        )
+        return EntropyFusion(population=self.population, floor=self.weight_floor)
 
 
 @dataclass
@@ -93,14 +78,12 @@ class Scaled(Adjusted):
     name: str = "mpfa_plus"
     signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
     # Signals are in units of their means, of which a floor of 1 is not one.
-    boost_bound: str = "none"
+    boost_bound: Bound = "none"
     # More than a step can bring, and less than a goal.
     positive_above: Any = 1.0
 
     def fusion(self) -> Fusion:
         """Make the fusion in equal shares."""
-        from torchrl_mpfa.fusion import ScaledFusion
-
         return ScaledFusion(super().fusion())
 
 
@@ -165,8 +148,6 @@ class LAP(Prioritized):
 
     def adjustments(self) -> list[Adjustment]:
         """Make the floor."""
-        from torchrl_mpfa.methods.lap import LAPFloor
-
         return [LAPFloor(self.priority_floor)]
 
 

@@ -31,15 +31,6 @@ def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
     return rank.pow(-alpha)
 
 
-def _share_in(order: Tensor, priority: Tensor, *, alpha: float) -> Tensor:
-    """Shares by the ranks that priorities would have in an order, negated and rising, ``[B]``."""
-    negated = -priority
-    above = torch.searchsorted(order, negated)
-    # Equal ones share the mean of their places; one that has no equal stands after those above.
-    until = torch.searchsorted(order, negated, right=True).maximum(above + 1)
-    return rank_share((above + until + 1).double() / 2, alpha=alpha)
-
-
 class RankPERSampler(SignalSampler):
     r"""Sampling by :math:`P(i) \propto (1 / \mathrm{rank}(i))^\alpha`, insensitive to outliers.
 
@@ -76,7 +67,12 @@ class RankPERSampler(SignalSampler):
         self._written = 0
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        return _share_in(self._order, priority, alpha=self._alpha)
+        # By the ranks that priorities would have in the last order.
+        order, negated = self._order, -priority
+        above = torch.searchsorted(order, negated)
+        # Equal ones share the mean of their places; one that has no equal stands after those above.
+        until = torch.searchsorted(order, negated, right=True).maximum(above + 1)
+        return rank_share((above + until + 1).double() / 2, alpha=self._alpha)
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         super()._write(slots, priority, learned=learned)

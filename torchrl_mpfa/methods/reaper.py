@@ -16,7 +16,6 @@ counts as the difference: :math:`R_t = \sum_{i \le t} |\delta_i| / F`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -142,26 +141,10 @@ class ReaPERSampler(SignalSampler):
         if last.any():
             self._rely(table, slots[last])
 
-    def update_signals(
-        self,
-        index: Tensor,
-        signals: Mapping[str, Tensor],
-        *,
-        storage: Storage,
-        written_at: Tensor | None = None,
-        batches: int = 1,
-    ) -> int:
-        """Store new signals of a batch, and set the leaves of its episodes.
-
-        As :meth:`SignalSampler.update_signals`.
-        """
-        stale = super().update_signals(
-            index, signals, storage=storage, written_at=written_at, batches=batches
-        )
+    def _learned_from(self, slots: Tensor, storage: Storage) -> None:
         self._steps = storage
-        slots = as_slots(index, storage).to(self.device)
+        slots = slots.to(self.device)
         self._rely(self.table, slots[slots < self.table.size])
-        return stale
 
     def _number(self, table: SignalTable) -> None:
         """Number the episodes of the rows that were written since this was last done."""

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from torchrl_mpfa.signals import OF_LEARNERS
+
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
     from torch import Tensor
@@ -14,8 +16,6 @@ if TYPE_CHECKING:
 
 SignalFunction = Callable[..., Any]
 """From a learner and a batch to a signal, shape ``[B]``."""
-OF_LOSSES = ("reward", "td_error", "action_gradient", "value", "information_gain")
-"""Signals that learners and losses write, or that are read at a write."""
 SIGNALS: dict[str, SignalFunction | type[SignalFunction]] = {}
 """The registered signals by name; :func:`register_signal` adds one."""
 
@@ -40,7 +40,7 @@ def register_signal(name: str, signal: SignalFunction | type[SignalFunction]) ->
     """
     if not callable(signal):
         raise TypeError(f"signal must be a function or a class, got {signal!r}")
-    if not name or name in OF_LOSSES:
+    if not name or name in ("reward", *OF_LEARNERS):
         raise ValueError(f"name must be one that no loss has, got {name!r}")
     SIGNALS[name] = signal
 
@@ -89,14 +89,10 @@ class OwnSignals:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of those that have one."""
-        states = {name: each for name, each in self._functions.items() if _has_state(each)}
-        return {name: each.state_dict() for name, each in states.items()}  # type: ignore[attr-defined]
+        both = [(n, f) for n, f in self._functions.items() if hasattr(f, "load_state_dict")]
+        return {n: f.state_dict() for n, f in both if hasattr(f, "state_dict")}
 
     def load_state_dict(self, states: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         for name, state in states.items():
             self._functions[name].load_state_dict(state)  # type: ignore[attr-defined]
-
-
-def _has_state(function: SignalFunction) -> bool:
-    return hasattr(function, "state_dict") and hasattr(function, "load_state_dict")

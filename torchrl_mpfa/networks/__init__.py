@@ -1,8 +1,5 @@
 """Actors and critics."""
 
-from typing import Any
-
-from torchrl_mpfa.lazy import find
 from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
 from torchrl_mpfa.networks.deterministic import (
     Actor,
@@ -33,8 +30,3 @@ __all__ = [
     "make_value_network",
     "sample_tanh_normal",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a module when it is first used."""
-    return find(__name__, name, {})

@@ -46,11 +46,6 @@ class DirectModule(TensorDictModule):
         torch.Size([1, 2])
     """
 
-    def __init__(
-        self, module: nn.Module, in_keys: list[NestedKey], out_keys: list[NestedKey]
-    ) -> None:
-        super().__init__(module, in_keys=in_keys, out_keys=out_keys)
-
     def outputs(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> dict[NestedKey, Tensor]:
@@ -175,8 +170,7 @@ class Critic(nn.Module):
             joined = torch.cat((self.first(observation), action), -1)
         else:
             joined = self.first(torch.cat((observation, action), -1))
-        value: Tensor = self.rest(joined)
-        return value
+        return self.rest(joined)
 
 
 class ValueNetwork(Layers):

@@ -1,8 +1,6 @@
 """Samplers: from segment trees, by fused signals, in slices, and with the paper's choices."""
 
-from typing import Any
-
-from torchrl_mpfa.lazy import find
+from torchrl_mpfa.samplers import uniform as uniform
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.mpfa import MPFASampler
 from torchrl_mpfa.samplers.prioritized import TreeSampler
@@ -10,8 +8,3 @@ from torchrl_mpfa.samplers.slices import SignalSliceSampler
 from torchrl_mpfa.samplers.table import SignalTable
 
 __all__ = ["MPFASampler", "SignalSampler", "SignalSliceSampler", "SignalTable", "TreeSampler"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a module when it is first used."""
-    return find(__name__, name, {})

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost
 from torchrl_mpfa.samplers.prioritized import TreeSampler
-from torchrl_mpfa.samplers.weighing import Fusing, Weighing
+from torchrl_mpfa.samplers.weighing import Weighing
 
 
 def composition(
-    sampler: Fusing, weighing: Weighing | None, batch: tuple[Tensor, Tensor] | None
+    sampler: Any, weighing: Weighing | None, batch: tuple[Tensor, Tensor] | None
 ) -> dict[str, float]:
     """Return numbers of the buffer, and of slots and weights of its last batch, by name."""
     table, weights = sampler.table, sampler.weights

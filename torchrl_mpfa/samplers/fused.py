@@ -19,15 +19,21 @@ from torchrl_mpfa.checks import (
     Level,
     check,
     check_counts,
-    check_index,
     check_shape,
 )
-from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
+from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, checked_weights, fuse
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.samplers.slots import Steps, as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.samplers.table import Agents, SignalTable, by_batch
-from torchrl_mpfa.samplers.weighing import Weighing, restored_weighing, warn_of_mean, weigh
+from torchrl_mpfa.samplers.weighing import (
+    COUNT_REFRESH,
+    Weighing,
+    counts_of,
+    one_sided,
+    restored_weighing,
+    warn_of_mean,
+)
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import REWARD, Signal, as_signals
 
@@ -42,7 +48,7 @@ class SignalSampler(TreeSampler):
 
         signals [B, K] --fusion--> p_i [B] --adjustments--> p'_i [B] --alpha--> tree
 
-    A fresh transition gets the highest priority in the buffer. Weights of Eq. (10) come as
+    A fresh transition gets the highest priority there was. Weights of Eq. (10) come as
     ``"priority_weight"``, divided by the largest one of the buffer.
 
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
@@ -55,7 +61,7 @@ class SignalSampler(TreeSampler):
         eps: :math:`\epsilon` of Eq. (21), added once, before the adjustments.
         dtype: Type of the importance weights.
         reduction: As in TorchRL.
-        max_priority_within_buffer: Highest priority that a fresh transition gets.
+        max_priority_within_buffer: True to give it the highest priority that is in the buffer.
         device: Device of priorities and sampled slots.
         stratified: True to sample one slot from each of ``B`` parts.
         signals: The signals to fuse, as objects or names.
@@ -129,17 +135,8 @@ class SignalSampler(TreeSampler):
         self._warned: set[str] = set()
         self._next_rows: Tensor | None = None
         self._attached = False
-        super().__init__(
-            max_capacity,
-            alpha,
-            beta,
-            eps,
-            dtype,
-            reduction,
-            max_priority_within_buffer,
-            device,
-            stratified=stratified,
-        )
+        rest = dtype, reduction, max_priority_within_buffer, device
+        super().__init__(max_capacity, alpha, beta, eps, *rest, stratified=stratified)
         self.table = self._empty_table()
         """Signals, reward, replay count and time of writing of every slot."""
         self._names = self.table.names[self.table.fused]
@@ -169,21 +166,6 @@ class SignalSampler(TreeSampler):
         check_adjustments(adjustments)
         self._adjustments, self._weighing = tuple(adjustments), None
         self._counting = [adjust.counts for adjust in adjustments]
-
-    @property
-    def recounts(self) -> bool:
-        """True if fusion or adjustments count at each update, or may have to."""
-        return self.fusion.every_batch or any(self._counting)
-
-    @property
-    def reward_key(self) -> NestedKey:
-        """Where the signed reward of a transition is read."""
-        return self._reward_key
-
-    @property
-    def agents(self) -> Agents | None:
-        """Number of a transition where there is one for each agent."""
-        return self._agents
 
     @property
     def positive_above(self) -> Level:
@@ -268,17 +250,10 @@ class SignalSampler(TreeSampler):
         """Take rows of :meth:`check_new` for the next :meth:`mark_update`; None: it reads them."""
         self._next_rows = rows
 
-    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Read the signals of new transitions in a storage, and give them the highest priority."""
-        self._maybe_init_from_storage(storage)
-        slots = check_index(as_slots(index, storage), self._max_capacity)
-        if slots.numel():
-            if storage is not None:
-                self._record(slots, storage)
-            self._mark(slots.to(self.device))
-
-    def _record(self, slots: Tensor, storage: Storage) -> None:
+    def _record(self, slots: Tensor, storage: Storage | None) -> None:
         """Keep the signals of new transitions, read from the storage unless they were handed in."""
+        if storage is None:
+            return
         rows, self._next_rows = self._next_rows, None
         if rows is None:
             rows = self.table.read(Steps(storage, slots), len(slots))
@@ -307,7 +282,7 @@ class SignalSampler(TreeSampler):
         """Set priorities directly, see :meth:`TreeSampler.update_priority`."""
         # TorchRL's buffers hand a first priority to transitions that they find in a storage.
         if not self._attached and self._highest is not None:
-            self.warn_once(
+            self._warn_once(
                 "one number",
                 f"{type(self).__name__} was given one number as the priority: it is neither fused "
                 "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. Use "
@@ -315,7 +290,7 @@ class SignalSampler(TreeSampler):
             )
         super().update_priority(index, priority, storage=storage)
 
-    def warn_once(self, subject: str, text: str) -> None:
+    def _warn_once(self, subject: str, text: str) -> None:
         """Warn of a subject that this sampler has not yet warned of."""
         if subject not in self._warned:
             self._warned.add(subject)
@@ -353,13 +328,14 @@ class SignalSampler(TreeSampler):
             TypeError: If the index holds anything but integers.
         """
         table = self.attach(storage)
-        slots = as_slots(index, storage)
+        sampled = slots = as_slots(index, storage)
         if slots.numel() == 0:
             return 0
         slots = slots.to(table.device)
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
-        rows, slots, live, sizes = table.learned_rows(slots, signals, written_at, batches)
-        stale = 0 if live is None else live.numel() - slots.numel()
+        count = slots.numel()
+        rows, slots, sizes = table.learned_rows(slots, signals, written_at, batches)
+        stale = count - slots.numel()
         if slots.numel() == 0:
             return stale
         # One group of all batches where that is allowed, else a group for each batch.
@@ -369,9 +345,9 @@ class SignalSampler(TreeSampler):
         for group_slots, group_rows in groups:
             if count := group_slots.numel():
                 first_batch = group_slots[: count // per_group]
-                weighing = weigh(self, first_batch, weighing)  # Eqs. (15)-(20).
+                weighing = self._weigh(first_batch, weighing)  # Eqs. (15)-(20).
                 # Eqs. (21)-(24).
-                priorities.append(self._fused(table, group_rows, group_slots, weighing, per_group))
+                priorities.append(self._fused(group_rows, group_slots, weighing, per_group))
         priority = priorities[0] if len(priorities) == 1 else torch.cat(priorities)
         if (last := last_of_each(slots)) is not None:
             slots, rows, priority = slots[last], rows[last], priority[last]
@@ -381,7 +357,39 @@ class SignalSampler(TreeSampler):
         self._weighing = weighing
         table.learn(slots, rows)
         self._set(slots, priority, highest)  # Eq. (8).
+        self._learned_from(sampled, storage)
         return stale
+
+    def _learned_from(self, slots: Tensor, storage: Storage) -> None:
+        """Change what depends on transitions that were learned from: nothing here."""
+
+    def _weigh(self, index: Tensor, last: Weighing | None) -> Weighing:
+        """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
+        table, refresh = self.table, self.entropy_refresh
+        weighing = last or Weighing()
+        changed = table.writes - weighing.writes
+        due = last is None or refresh == 0 or not 0 <= changed <= refresh * table.size
+        if due or self.fusion.every_batch:
+            weights = checked_weights(self.fusion, self._names, table, index)
+            weighing = replace(weighing, weights=weights)
+        if due:
+            level, rewards = self.positive_above, table.rewards
+            if (text := one_sided(level, rewards, self.fusion, self.adjustments)) is not None:
+                self._warn_once("one side", text)
+            mean = float(rewards.mean())
+            weighing = replace(weighing, mean_reward=mean, writes=table.writes)
+        return self._count(len(index), weighing) if any(self._counting) else weighing
+
+    def _count(self, batch_size: int, weighing: Weighing) -> Weighing:
+        """Have the adjustments count the buffer, by present weights, if enough of it changed."""
+        table = self.table
+        changed = table.writes - weighing.counted_writes + weighing.learned_since
+        few = 0 <= changed <= COUNT_REFRESH * table.size and self.entropy_refresh > 0
+        if weighing.counted and few:
+            return replace(weighing, learned_since=weighing.learned_since + batch_size)
+        fused = self._combined(table.rows[: table.size], weighing)
+        counted, writes = counts_of(self.adjustments, table, fused), table.writes
+        return replace(weighing, counted=counted, counted_writes=writes, learned_since=batch_size)
 
     def _takes_batches(self) -> bool:
         """Return True if equal batches can be fused and adjusted in one call."""
@@ -390,14 +398,10 @@ class SignalSampler(TreeSampler):
             return False
         return all(adjust.takes_batches for adjust in self.adjustments)
 
-    def _fused(
-        self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing, batches: int
-    ) -> Tensor:
+    def _fused(self, rows: Tensor, slots: Tensor, weighing: Weighing, batches: int) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
-        priority = self.combined(rows, weighing)
-        columns = table.reward_column, table.count_column, table.time_column
-        reward, replay_count, written_at = (rows.select(1, column) for column in columns)
-        numbers = [priority, reward, replay_count, slots, written_at]
+        *_, reward, replay_count, written_at = rows.unbind(1)
+        numbers = [self._combined(rows, weighing), reward, replay_count, slots, written_at]
         if batches > 1:
             numbers = [number.view(batches, -1) for number in numbers]
         priority, reward, replay_count, slots, written_at = numbers
@@ -410,7 +414,7 @@ class SignalSampler(TreeSampler):
             priority = check_shape(name, adjust(priority, facts), slots.shape)
         return priority.double().reshape(-1) if batches > 1 else priority.double()
 
-    def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
+    def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""
         return fuse(rows[:, self.table.fused], weighing.weights, eps=self._eps)
 

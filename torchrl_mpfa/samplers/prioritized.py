@@ -20,14 +20,13 @@ from torchrl_mpfa.checks import (
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each, random_shares
+from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.samplers.states import SavedTrees
 from torchrl_mpfa.samplers.trees import HasTrees, is_learned, make_trees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _LOG_POSITIVE = math.log(1e-200)
 """A leaf with a logarithm above this is not rounded to zero by any sampler."""
-_CPU = torch.device("cpu")
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
@@ -91,7 +90,6 @@ class TreeSampler(HasTrees, SavedTrees):
         if dtype not in (torch.float, torch.double):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.stratified = stratified
-        self._weight_dtype = dtype
         self._follows = device is None
         # With its number, as storages have it.
         where = None if device is None else torch.empty(0, device=device).device
@@ -104,7 +102,6 @@ class TreeSampler(HasTrees, SavedTrees):
         # were given, and one outlier would stay.
         self.trees = make_trees(self._max_capacity, self.device)
         self._highest: float | None = None
-        self._highest_slot: int | None = None
         # True on a GPU while all priorities are surely positive, so that sampling need not wait.
         self._positive = False
 
@@ -119,7 +116,7 @@ class TreeSampler(HasTrees, SavedTrees):
             self._takes_capacity = False
             self._resize(storage.max_size)
         device = getattr(storage, "device", None)
-        if device == (self._device or _CPU) or not isinstance(device, torch.device):
+        if device == self.device or not isinstance(device, torch.device):
             return
         if not self._follows:
             raise ValueError(
@@ -146,23 +143,18 @@ class TreeSampler(HasTrees, SavedTrees):
     @alpha.setter
     def alpha(self, value: float) -> None:
         value = float(check(_ALPHA, alpha=value))
-        self._check_alpha(value)
-        before, self._alpha = self._alpha, value
-        if value != before:
-            self._retransform_priority_trees(before, value)
-
-    def _check_alpha(self, value: float) -> None:
-        """Reject an exponent by which priorities vanish or overflow."""
         written = self.priorities()
         written = written[written > 0]
         before, self._alpha = self._alpha, value
         leaf = self._leaf(written)
-        self._alpha = before
         if not (leaf.sum() < math.inf and leaf.reciprocal().sum() < math.inf):
+            self._alpha = before
             raise ValueError(
                 f"alpha must leave the priorities, from {written.min():g} to {written.max():g}, "
                 f"positive and of a finite sum, got {value}"
             )
+        if value != before:
+            self._retransform_priority_trees(before, value)
 
     @property
     def beta(self) -> float:
@@ -172,22 +164,6 @@ class TreeSampler(HasTrees, SavedTrees):
     @beta.setter
     def beta(self, value: float) -> None:
         self._beta = float(check(NOT_NEGATIVE, beta=value))
-
-    @property
-    def _max_priority(self) -> tuple[float | None, int | None]:
-        """Return the highest priority without eps and its slot, as TorchRL's sampler has them."""
-        highest = self._highest_priority()
-        if highest is None:
-            return None, None
-        if not self._max_priority_within_buffer or self._alpha == 0:
-            return max(highest - self._eps, 0.0), self._highest_slot
-        return max(highest - self._eps, 0.0), int(self.trees.priorities.nan_to_num(-1.0).argmax())
-
-    @_max_priority.setter
-    def _max_priority(self, value: tuple[float | None, int | None] | None) -> None:
-        highest, slot = (None, None) if value is None else value
-        self._highest = None if highest is None else float(highest) + self._eps
-        self._highest_slot = slot
 
     def _highest_priority(self) -> float | None:
         """Return the highest priority, eps included; None before the first update."""
@@ -236,11 +212,6 @@ class TreeSampler(HasTrees, SavedTrees):
 
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample slots of the flattened storage and their weights, both of shape ``[B]``."""
-        slots, weight = self._sample_slots(self._filled(storage, batch_size), batch_size)
-        return slots, weight.to(self.dtype)
-
-    def _filled(self, storage: Storage, batch_size: int) -> int:
-        """Return the number of slots that a batch can be sampled from."""
         self._maybe_init_from_storage(storage)
         if self._rng is None:
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
@@ -251,26 +222,23 @@ class TreeSampler(HasTrees, SavedTrees):
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")
-        return size
+        slots, weight = self._sample_slots(size, batch_size)
+        return slots, weight.to(self.dtype)
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample out of the first ``size`` slots: slots and weights, both of shape ``[B]``."""
         lowest = self.trees.lowest(size)
         if not self._positive:
-            self._check_positive(self.trees.sum(size), lowest)
+            total = self.trees.sum(size)
+            if not bool((total > 0) & (lowest > 0)):
+                raise RuntimeError(
+                    f"every priority must be positive to sample, got a sum of {total} and a lowest "
+                    f"of {lowest}: raise eps, or give the buffer its sampler before its data"
+                )
             # A GPU is waited for once, and again after a priority that may be too low.
             self._positive = self.trees.waits
         index, leaf = self._proportional(self.trees, size, batch_size)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
-
-    @staticmethod
-    def _check_positive(total: Any, lowest: Any) -> None:
-        """Reject slots of which none can be sampled, or one has no priority."""
-        if not bool((total > 0) & (lowest > 0)):
-            raise RuntimeError(
-                f"every priority must be positive to sample, got a sum of {total} and a lowest "
-                f"of {lowest}: raise eps, or give the buffer its sampler before its data"
-            )
 
     def batch_weights(self, size: int) -> Tensor:
         """Return the weight of Eq. (10) that each of the first slots would have in a batch.
@@ -299,12 +267,16 @@ class TreeSampler(HasTrees, SavedTrees):
 
     def _proportional(self, trees: Any, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Sample slots in proportion to the leaves of trees; slots and leaves, both ``[B]``."""
-        slots, leaf = trees.find(self._mass(batch_size), size)
-        return slots, leaf
+        return trees.find(self._mass(batch_size), size)
 
     def _mass(self, batch_size: int) -> Tensor:
         """Sample shares of the total priority to look up, in [0, 1), shape ``[B]``."""
-        return random_shares(batch_size, stratified=self.stratified, **self._random())
+        random = self._random()
+        shares = torch.rand(batch_size, dtype=torch.double, **random)
+        if not self.stratified:
+            return shares
+        # In random order: in a batch sorted by slot, a place would depend on the age.
+        return shares.add_(torch.randperm(batch_size, **random)).div_(batch_size)
 
     def _random(self) -> dict[str, Any]:
         """Return the device, and a generator on it for the random numbers of one call."""
@@ -315,13 +287,17 @@ class TreeSampler(HasTrees, SavedTrees):
         self._maybe_init_from_storage(storage)
         slots = check_index(as_slots(index, storage), self._max_capacity)
         if slots.numel():
+            self._record(slots, storage)
             self._mark(slots.to(self.device))
+
+    def _record(self, slots: Tensor, storage: Storage | None) -> None:
+        """Keep what is known of new transitions: nothing here."""
 
     def _mark(self, slots: Tensor) -> None:
         """Give the transitions in slots the highest priority."""
         priority = self._fresh_priority()
         if self._highest is None:
-            self._keep_highest(float(priority), int(slots[0]))
+            self._highest = float(priority)
         fresh = slots.new_empty(slots.shape, dtype=torch.double).fill_(priority)
         self._write(slots, fresh, learned=False)
 
@@ -374,7 +350,11 @@ class TreeSampler(HasTrees, SavedTrees):
         highest = self._checked(value + self._eps)
         if (last := last_of_each(stored)) is not None:
             stored, value = stored[last], value[last]
-        inherited, value = self._inherited(stored, value), value + self._eps
+        # TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
+        # transitions that they find in a storage, and for batches without a priority.
+        default = torch.tensor(self.default_priority, device="cpu").float()
+        inherited = ~is_learned(self.trees.priorities[stored]) & (value.float() == default)
+        value = value + self._eps
         if bool(inherited.any()):
             self._write(stored[inherited], value[inherited], learned=False)
             stored, value = stored[~inherited], value[~inherited]
@@ -385,15 +365,6 @@ class TreeSampler(HasTrees, SavedTrees):
         """Reject priorities of new transitions, before eps, as :meth:`update_priority`."""
         check_not_negative("priority", priority)
         self._checked(priority.to(torch.double) + self._eps)
-
-    def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
-        """Mask of rows that only get the highest priority, as fresh ones have, shape ``[B]``.
-
-        TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
-        transitions that they find in a storage, and for batches without a priority.
-        """
-        fresh = ~is_learned(self.trees.priorities[slots])
-        return fresh & (value.float() == torch.tensor(self.default_priority, device="cpu").float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
         """Return the highest of priorities, eps included; reject those that poison a tree."""
@@ -409,13 +380,8 @@ class TreeSampler(HasTrees, SavedTrees):
         """Write priorities that an update gave, eps included, of which this is the highest."""
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
-            stored = self.priorities(slots)  # Of a slot that is named twice the last one.
-            self._keep_highest(float(stored.max()), int(slots[stored.argmax()]))
-
-    def _keep_highest(self, highest: float, slot: int) -> None:
-        """Keep a priority and its slot if none was as high so far."""
-        if self._highest is None or highest > self._highest:
-            self._highest, self._highest_slot = highest, slot
+            # Of a slot that is named twice the last one.
+            self._highest = max(float(self.priorities(slots).max()), self._highest or 0.0)
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""

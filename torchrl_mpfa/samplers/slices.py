@@ -15,7 +15,7 @@ from torchrl_mpfa.episodes import follows
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.slots import as_slots
 from torchrl_mpfa.saving import check_saved
-from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.entries import as_path
 
 SlicePriority = Literal["mean", "start"]
 """Priority of a slice: the mean over its steps, or that of its first step."""
@@ -180,7 +180,7 @@ class SignalSliceSampler(SignalSampler):
                 "several environments go to a storage with ndim=2"
             )
         starts, weight = super()._sampled(storage, batch_size // self.slice_len)
-        slots, inside = self._windows(starts, self._joined, self._stride)
+        slots, inside = self._windows(starts)
         self._lengths = inside.sum(1)
         return slots[inside], weight.repeat_interleave(self._lengths)
 
@@ -204,7 +204,7 @@ class SignalSliceSampler(SignalSampler):
             slots = check_index(as_slots(index, storage), self._max_capacity)
             self._refresh(self._starts_around(slots))
 
-    def _record(self, slots: Tensor, storage: Storage) -> None:
+    def _record(self, slots: Tensor, storage: Storage | None) -> None:
         super()._record(slots, storage)
         for part in slots.split(_AT_ONCE):
             self._join(part, storage)
@@ -226,12 +226,12 @@ class SignalSliceSampler(SignalSampler):
         joined &= (ids[0] == ids[1]).squeeze(1) & follows(storage, table, slots, following)
         self._joined[slots] = joined
 
-    def _windows(self, starts: Tensor, joined: Tensor, stride: int) -> tuple[Tensor, Tensor]:
+    def _windows(self, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Return the slots of slices and the mask of one trajectory, both ``[S, L]``."""
-        slots = starts.unsqueeze(1) + stride * torch.arange(self.slice_len, device="cpu")
+        slots = starts.unsqueeze(1) + self._stride * torch.arange(self.slice_len, device="cpu")
         slots %= self._max_capacity
         inside = torch.ones(slots.shape, dtype=torch.bool, device="cpu")
-        inside[:, 1:] = joined[slots[:, :-1]].cumprod(1).bool()
+        inside[:, 1:] = self._joined[slots[:, :-1]].cumprod(1).bool()
         return slots, inside
 
     def _starts_around(self, slots: Tensor) -> Tensor:
@@ -250,20 +250,14 @@ class SignalSliceSampler(SignalSampler):
         priorities = self.priorities()
         starts = starts[priorities[starts].isfinite()]
         for part in starts.split(_AT_ONCE):
-            priority, full = self._of_slices(part, priorities, self._joined, self._stride)
+            slots, inside = self._windows(part)
+            length = inside.sum(1)
+            full = (length == self.slice_len) | (not self.strict_length)
+            priority = priorities[part]
+            if self.slice_priority == "mean":
+                priority = priorities[slots].where(inside, 0.0).sum(1) / length
             # What cannot be sampled is not the lowest.
             self.trees.put(part, self._leaf(priority).where(full, -0.0))
-
-    def _of_slices(
-        self, starts: Tensor, priorities: Tensor, joined: Tensor, stride: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return each slice's priority and a mask of full-length slices, both ``[S]``."""
-        slots, inside = self._windows(starts, joined, stride)
-        length = inside.sum(1)
-        full = (length == self.slice_len) | (not self.strict_length)
-        if self.slice_priority == "start":
-            return priorities[starts], full
-        return priorities[slots].where(inside, 0.0).sum(1) / length, full
 
     def _restore(self, state: dict[str, Any]) -> None:
         check_saved("sampler", state, **{name: getattr(self, name) for name in _SETTINGS})

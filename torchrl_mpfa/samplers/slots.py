@@ -10,7 +10,7 @@ from tensordict import is_tensor_collection
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.storages.schema import as_integers
+from torchrl_mpfa.storages.entries import as_integers
 
 _ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
@@ -30,7 +30,7 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
         return index.resolve_neg()
     slots = as_integers(index)
-    if slots.ndim <= 1 or len(slots) == 0:
+    if slots.ndim <= 1 or len(slots) == 0 or getattr(storage, "ndim", 0) == 1:
         return slots.reshape(-1)
     # Not the filled part of it: a batch may be from before the storage was emptied.
     shape = getattr(storage, "_total_shape", None)
@@ -89,12 +89,3 @@ class Steps:
         if entry is None:
             return default
         return entry.flatten(0, self._ndim - 1)[self._slots.to(entry.device)]
-
-
-def random_shares(count: int, *, stratified: bool, **random: Any) -> Tensor:
-    """Sample shares in [0, 1), from all of it or from each of so many equal parts, ``[B]``."""
-    shares = torch.rand(count, dtype=torch.double, **random)
-    if not stratified:
-        return shares
-    # In random order: in a batch sorted by slot, a place would depend on the age.
-    return shares.add_(torch.randperm(count, **random)).div_(count)

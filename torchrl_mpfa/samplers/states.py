@@ -75,7 +75,7 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
     """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves and loads."""
 
     KIND = "proportional"
-    SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest", "_highest_slot")
+    SAVED: tuple[str, ...] = ("_alpha", "_beta", "_eps", "_highest")
     _alpha: float
     _beta: float
     trees: Any

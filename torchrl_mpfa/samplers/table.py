@@ -141,7 +141,9 @@ class SignalTable:
             same = signal.key == self.reward_key
             value = reward if same else self._column(data, signal.key, signal.name, count)
             if value is not None:
-                rows.select(1, self.column[signal.name]).copy_(_written_priority(signal, value))
+                priority = _priority(signal, value)
+                check_not_negative(f"signal {signal.name!r}", priority)
+                rows.select(1, self.column[signal.name]).copy_(priority)
             elif whole:
                 raise KeyError(_LACKS.format(signal.name, signal.key))
         if reward is not None:
@@ -171,8 +173,8 @@ class SignalTable:
         signals: Mapping[str, Tensor],
         written_at: Tensor | None,
         batches: int,
-    ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
-        """Return copies of live rows with new learned signals, and as :meth:`_live_rows`.
+    ) -> tuple[Tensor, Tensor, list[int]]:
+        """Return copies of live rows with new learned signals, their slots, and sizes of batches.
 
         Raises:
             KeyError: If a signal is missing.
@@ -186,11 +188,11 @@ class SignalTable:
             end = self._reachable(written_at)
             rows = join(self.rows, slots, new, written_at, end, self.fused.stop)
             if rows is not None:
-                return rows, slots, None, [slots.numel() // batches] * batches
+                return rows, slots, [slots.numel() // batches] * batches
         rows, slots, live, sizes = self._live_rows(slots, written_at, batches)
         self.fill_learned(rows, signals, live, sizes)
         self._check_fused(rows)
-        return rows, slots, live, sizes
+        return rows, slots, sizes
 
     def _reachable(self, written_at: Tensor | None) -> int:
         """Return the slots that a batch may be of."""
@@ -305,7 +307,7 @@ class SignalTable:
         self.writes += count
 
     def learn(self, slots: Tensor, rows: Tensor) -> None:
-        """Write the learned signals of rows of :meth:`_live_rows`; the last of a slot counts."""
+        """Write the learned signals of rows of :meth:`learned_rows`; the last of a slot counts."""
         count = len(self.learned)
         if has_loops(self.rows):
             give(self.rows, slots, rows, count)
@@ -374,14 +376,3 @@ def _priority(signal: Signal, value: Tensor) -> Tensor:
     """Return the priorities of a signal by its function, by default the absolute values."""
     name = f"priority of signal {signal.name!r}"
     return check_shape(name, (signal.priority or torch.abs)(value), value.shape)
-
-
-def _written_priority(signal: Signal, value: Tensor) -> Tensor:
-    """Return the priorities of a signal known at the write, of finite numbers."""
-    if signal.priority is None:
-        return value.abs()
-    priority = _priority(signal, value)
-    low, high = bounds(priority)
-    if not (low >= 0 and high < math.inf):
-        check_not_negative(f"signal {signal.name!r}", priority)
-    return priority

@@ -75,16 +75,8 @@ class CompiledTrees:
         """Set leaves of slots, and their priorities where these are given, each ``[B]``."""
         count, slots, leaf = slots.numel(), slots.contiguous(), _numbers(leaf)
         priority = None if priority is None else _numbers(priority)
-        if loops().put(
-            self._leaf.data_ptr(),
-            self._priority.data_ptr(),
-            self._nodes.data_ptr(),
-            self._size,
-            address(slots, torch.long),
-            leaf.data_ptr(),
-            None if priority is None else priority.data_ptr(),
-            count,
-        ):
+        given = leaf.data_ptr(), None if priority is None else priority.data_ptr()
+        if loops().put(*self._memory(), self._size, address(slots, torch.long), *given, count):
             raise IndexError(f"slots must be in [0, {self._size}), got {slots.tolist()}")
 
     @opaque
@@ -92,16 +84,9 @@ class CompiledTrees:
         """Return the slots at shares of the sum of the first leaves, and their leaves, ``[B]``."""
         slots = torch.empty(shares.shape, dtype=torch.long, device="cpu")
         leaves = torch.empty_like(shares)
-        loops().find(
-            self._leaf.data_ptr(),
-            self._nodes.data_ptr(),
-            self._size,
-            min(size, self._size),
-            address(shares, torch.double),
-            shares.numel(),
-            slots.data_ptr(),
-            leaves.data_ptr(),
-        )
+        leaf, _, nodes = self._memory()
+        asked = min(size, self._size), address(shares, torch.double), shares.numel()
+        loops().find(leaf, nodes, self._size, *asked, slots.data_ptr(), leaves.data_ptr())
         return slots, leaves
 
     def sum(self, size: int) -> float:
@@ -119,9 +104,11 @@ class CompiledTrees:
     @opaque
     def _query(self, kind: int, size: int) -> float:
         """Return what the root has of the first leaves."""
-        parts = self._leaf.data_ptr(), self._priority.data_ptr(), self._nodes.data_ptr()
-        result: float = loops().query(*parts, kind, self._size, size)
-        return result
+        return loops().query(*self._memory(), kind, self._size, size)
+
+    def _memory(self) -> tuple[int, int, int]:
+        """Return addresses, which change where memory becomes shared."""
+        return self._leaf.data_ptr(), self._priority.data_ptr(), self._nodes.data_ptr()
 
 
 def _numbers(values: Tensor) -> Tensor:
@@ -166,8 +153,7 @@ class PlainTrees:
     def leaves(self, slots: Tensor) -> Tensor:
         """Return leaves of slots, shape ``[B]``."""
         if self.waits:
-            leaves: Tensor = self._sums[slots]
-            return leaves
+            return self._sums[slots]
         # Given a tensor, the binding first tries it as a number, and spends ten times as long on
         # the error as on the leaves. Of an array it reads the memory from the start.
         return torch.from_numpy(self._sums[slots.contiguous().numpy()])

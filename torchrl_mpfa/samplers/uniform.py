@@ -12,7 +12,7 @@ import torch
 from torchrl.data import RandomSampler, Storage
 
 from torchrl_mpfa.samplers.states import SavedSampler
-from torchrl_mpfa.storages.schema import as_integers
+from torchrl_mpfa.storages.entries import as_integers
 
 
 class NewestSampler(SavedSampler, RandomSampler):

@@ -4,62 +4,24 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import Adjustment
 from torchrl_mpfa.checks import Level, check_not_negative
-from torchrl_mpfa.fusion import Fusion, checked_weights
+from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.saving import check_saved
 
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
-_COUNT_REFRESH = 1 / 16
+COUNT_REFRESH = 1 / 16
 _ENOUGH = 100
 """With fewer rewards there is no warning that all are on one side."""
 _NO_WEIGHTS = torch.empty(0, device="cpu")
-
-
-class Fusing(Protocol):
-    """What is read of a sampler that fuses signals."""
-
-    @property
-    def table(self) -> SignalTable:
-        """Signals, reward, replay count and time of writing of every slot."""
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """Weight of each signal at the last count."""
-
-    @property
-    def fusion(self) -> Fusion:
-        """How signals become one priority."""
-
-    @property
-    def adjustments(self) -> Sequence[Adjustment]:
-        """Changes of fused priorities, in order."""
-
-    @property
-    def positive_above(self) -> Level:
-        """Reward above which a transition is positive."""
-
-    @property
-    def recounts(self) -> bool:
-        """True if fusion or adjustments count at each update, or may have to."""
-
-    @property
-    def entropy_refresh(self) -> float:
-        """Share of the buffer that may be rewritten before weights are counted again."""
-
-    def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
-        """Return priorities by Eq. (21), eps included, shape ``[B]``."""
-
-    def warn_once(self, subject: str, text: str) -> None:
-        """Warn of a subject that this sampler has not yet warned of."""
 
 
 @dataclass(frozen=True)
@@ -129,58 +91,30 @@ def restored_weighing(
     )
 
 
-def weigh(sampler: Fusing, index: Tensor, last: Weighing | None) -> Weighing:
-    """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
-    table, refresh = sampler.table, sampler.entropy_refresh
-    weighing = last or Weighing()
-    changed = table.writes - weighing.writes
-    due = last is None or refresh == 0 or not 0 <= changed <= refresh * table.size
-    if not (due or sampler.recounts):
-        return weighing
-    if due or sampler.fusion.every_batch:
-        names = table.names[table.fused]
-        weighing = replace(weighing, weights=checked_weights(sampler.fusion, names, table, index))
-    if due:
-        if (text := one_sided(sampler)) is not None:
-            sampler.warn_once("one side", text)
-        mean = float(table.rewards.mean())
-        weighing = replace(weighing, mean_reward=mean, writes=table.writes)
-    if not any(adjust.counts for adjust in sampler.adjustments):
-        return weighing
-    return _count(sampler, len(index), weighing)
-
-
-def _count(sampler: Fusing, batch_size: int, weighing: Weighing) -> Weighing:
-    """Have the adjustments count the buffer again, by present weights, if enough of it changed."""
-    table = sampler.table
-    changed = table.writes - weighing.counted_writes + weighing.learned_since
-    few = 0 <= changed <= _COUNT_REFRESH * table.size and sampler.entropy_refresh > 0
-    if weighing.counted and few:
-        return replace(weighing, learned_since=weighing.learned_since + batch_size)
-    fused = sampler.combined(table.rows[: table.size], weighing)
-    counted = [
-        adjust.count(table, fused) if adjust.counts else None for adjust in sampler.adjustments
-    ]
+def counts_of(
+    adjustments: Sequence[Adjustment], table: SignalTable, fused: Tensor
+) -> tuple[Tensor | None, ...]:
+    """Return what adjustments count in a buffer, of fused priorities ``[N]``; None if nothing."""
+    counted = tuple(part.count(table, fused) if part.counts else None for part in adjustments)
     for value in counted:
         if value is not None:
             check_not_negative("what an adjustment counted", value)
-    return replace(
-        weighing, counted=tuple(counted), counted_writes=table.writes, learned_since=batch_size
-    )
+    return counted
 
 
-def one_sided(sampler: Fusing) -> str | None:
+def one_sided(
+    level: Level, rewards: Tensor, fusion: Fusion, adjustments: Sequence[Adjustment]
+) -> str | None:
     """Return a warning if all rewards of a buffer are on one side of the level of a sampler.
 
     There is none for few rewards, nor for rewards that are all equal, which no level separates.
     """
-    level, rewards = sampler.positive_above, sampler.table.rewards
-    used = sampler.fusion.uses_level or any(part.uses_level for part in sampler.adjustments)
+    used = fusion.uses_level or any(part.uses_level for part in adjustments)
     if level == "mean" or not used or len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
         return None
     above = int((rewards > level).sum())
     # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
-    waits = above == 0 and level > 0 and not sampler.fusion.uses_level
+    waits = above == 0 and level > 0 and not fusion.uses_level
     if waits or 0 < above < len(rewards):
         return None
     return (

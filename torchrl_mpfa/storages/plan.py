@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.native import address, find_loops, is_plain, loops, opaque
-from torchrl_mpfa.storages.schema import INDEX_KEY, as_path, check_finite, named
+from torchrl_mpfa.storages.entries import INDEX_KEY, as_path, check_finite, named
 
 _WIDTH = 4
 """Numbers of a column: addresses of what is stored and of the rows, bytes of a row, precision.
@@ -71,10 +71,6 @@ class RowPlan:
         # True if compiled loops read and write all entries.
         self._by_c = ndim == 1 and find_loops() is not None
         self._root = self._describe(stored, ndim, ())
-        index = self._root.tree.get(INDEX_KEY)
-        self._index: _Entry | None = None
-        if isinstance(index, _Entry) and index.dtype is torch.long and not index.row:
-            self._index = index
 
     def _describe(self, stored: TensorDictBase, ndim: int, path: _Path) -> _Branch:
         tree: _Tree = {}
@@ -132,12 +128,12 @@ class RowPlan:
         return wrong
 
     @opaque
-    def match(self, data: TensorDictBase, *, with_index: bool = True) -> NewRows | None:
+    def match(self, data: TensorDictBase, slots: Tensor | None = None) -> NewRows | None:
         """Return new rows as loops take them; None if PyTorch has to, or finds fault with them.
 
         Args:
             data: Rows, batch size ``[B]``.
-            with_index: False if the entry in which TorchRL's writers put the slot is missing.
+            slots: The entry in which TorchRL's writers put the slot; None: the rows have it.
         """
         if not self._by_c or type(data) is not TensorDict or data.ndim != 1:
             return None
@@ -145,12 +141,10 @@ class RowPlan:
             return None
         columns = array("q", self._columns)
         values: list[Tensor] = []
-        index = None if with_index else self._index
-        if index is None and not with_index:
+        entries = data._tensordict if slots is None else {**data._tensordict, INDEX_KEY: slots}
+        if not _match(self._root.tree, entries, len(data), columns, values):
             return None
-        if not _match(self._root.tree, data, len(data), columns, values, index):
-            return None
-        rows = NewRows(columns, values, len(data), index)
+        rows = NewRows(columns, values, len(data))
         return None if rows.is_wrong() else rows
 
     def check(self, data: TensorDictBase, lead: int) -> None:
@@ -170,7 +164,6 @@ class NewRows:
     columns: array[int]
     values: list[Tensor]  # Kept until they are written.
     count: int
-    index: _Entry | None
 
     def __len__(self) -> int:
         return self.count
@@ -187,8 +180,6 @@ class NewRows:
             return False
         slots = slots.contiguous()
         place = address(slots, torch.long)
-        if self.index is not None:
-            _join(self.columns, self.index, slots)
         first = self.columns.buffer_info()[0]
         return not loops().scatter(first, len(self.columns) // _WIDTH, place, self.count, end)
 
@@ -227,25 +218,19 @@ def _empty(
 
 
 def _match(
-    tree: _Tree,
-    data: TensorDict,
-    count: int,
-    columns: array[int],
-    values: list[Tensor],
-    absent: _Entry | None = None,
+    tree: _Tree, entries: Mapping[str, Any], count: int, columns: array[int], values: list[Tensor]
 ) -> bool:
     """Put addresses of new rows into the columns; return False if they are of another form."""
-    entries = data._tensordict
-    if len(entries) + (absent is not None) != len(tree):
+    if len(entries) != len(tree):
         return False
     for key, entry in tree.items():
         value = entries.get(key)
         if isinstance(entry, _Branch):
-            below = (entry.tree, value, count, columns, values)
-            if type(value) is not TensorDict or not _match(*below):
+            below = value._tensordict if isinstance(value, TensorDict) else None
+            if type(value) is not TensorDict or not _match(
+                entry.tree, below or {}, count, columns, values
+            ):
                 return False
-        elif entry is absent and value is None:
-            continue
         elif not (
             isinstance(value, Tensor)
             and value.dtype is entry.dtype

@@ -32,8 +32,7 @@ def state_of(part: Any) -> dict[str, Any]:
     """
     if not _has_files(part):
         _check_tensors(getattr(part, "_storage", None))
-        state: dict[str, Any] = part.state_dict()
-        return state
+        return part.state_dict()
     with TemporaryDirectory() as name:
         folder = Path(name)
         if isinstance(part, Storage):

@@ -15,7 +15,8 @@ from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from mpfa_envs.env.episodes import EpisodeSource
 from torchrl_mpfa.checks import Rule, rules_of
 from torchrl_mpfa.methods import METHODS, Method
-from torchrl_mpfa.methods.registered import OF_LOSSES, SIGNALS
+from torchrl_mpfa.methods.registered import SIGNALS
+from torchrl_mpfa.signals import OF_LEARNERS
 from training.environments import FilteredRobots, episode_arguments, task_arguments
 from training.evaluating import check_physics
 from training.settings.environment import EnvironmentSettings
@@ -113,7 +114,7 @@ def _check_method(method: Method) -> None:
     """Raise if the method rejects its settings, or cannot learn with them."""
     with named("method."):
         replace(method)
-    known = [*OF_LOSSES, *SIGNALS]
+    known = ["reward", *OF_LEARNERS, *SIGNALS]
     for signal in method.priority_signals():
         # What a signal is made of, by whatever name.
         entry = signal.key[-1] if isinstance(signal.key, tuple) else signal.key

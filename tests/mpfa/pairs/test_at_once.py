@@ -119,7 +119,7 @@ def _check_whole(twins, choice):
         assert (rows["observation"] == rows["observation"][:, :1]).all()
         if choice["transform"] == "none":
             assert rows["next", "observation"].equal(rows["observation"] + 1)
-            key = twins.tried.sampler.reward_key
+            key = twins.tried.sampler.table.reward_key
             assert buffer.rewards().equal(rows[key].reshape(-1).double())
     # A sampler that loads the state makes its trees from the leaves: no tree disagrees with them.
     fresh = twins.make()

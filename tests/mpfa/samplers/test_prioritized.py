@@ -154,10 +154,6 @@ def test_alpha_may_leave_zero_exactly():
     assert leaves(sampler, 10)[8:].tolist() == [0.0, 0.0]
 
 
-def states_of(sampler):
-    return {key: value for key, value in sampler.state_dict().items() if key != "_highest_slot"}
-
-
 @pytest.mark.parametrize("kind", [TreeSampler, RankPERSampler, LA3PSampler])
 @pytest.mark.parametrize(
     ("name", "value", "error"),
@@ -171,10 +167,10 @@ def states_of(sampler):
 def test_an_exponent_that_cannot_be_is_rejected_and_changes_nothing(kind, name, value, error):
     sampler = kind(64, 0.6, 0.4, 0.01)
     sampler.update_priority(torch.arange(64), torch.logspace(-2, 5, 64))
-    before = states_of(sampler)
+    before = sampler.state_dict()
     with pytest.raises(error, match=f"{name} must"):
         setattr(sampler, name, value)
-    assert same(states_of(sampler), before)
+    assert same(sampler.state_dict(), before)
     setattr(sampler, name, 0.9)
     assert getattr(sampler, name) == 0.9
 
@@ -215,16 +211,6 @@ def test_torchrl_reads_the_trees_by_its_own_names():
     assert sampler._sum_tree.query(0, 3) == 4.5
     with pytest.raises(ValueError, match="start must be 0, got 1"):
         sampler._sum_tree.query(1, 3)
-
-
-def test_slot_of_the_highest_priority_is_that_of_torchrl():
-    ours, theirs = TreeSampler(4, 1.0, 0.4), PrioritizedSampler(4, 1.0, 0.4)
-    # Of equal priorities the first.
-    for slots, priority, highest in (([2], 3.0, 2), ([0], 1.0, 2), ([0], 3.0, 2), ([1, 3], 5.0, 3)):
-        for sampler in (ours, theirs):
-            values = torch.full((len(slots),), priority) - torch.arange(len(slots)).flip(0)
-            sampler.update_priority(torch.tensor(slots), values)
-        assert int(ours._max_priority[1]) == int(theirs._max_priority[1]) == highest
 
 
 # Fresh transitions get the highest priority that an update gave.
