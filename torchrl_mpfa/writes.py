@@ -19,8 +19,8 @@ from torchrl_mpfa.native import opaque
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.sharing import SharedWrites, WriterSampler, check_shared
-from torchrl_mpfa.storages.plan import NewRows, RowPlan
 from torchrl_mpfa.storages.entries import as_path, check_finite_entries
+from torchrl_mpfa.storages.plan import NewRows, RowPlan
 from torchrl_mpfa.storages.tensor import SignalMemmapStorage, SignalTensorStorage, slots_of
 from torchrl_mpfa.transforms import TransformMemory
 
@@ -184,12 +184,9 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         if in_a_ring and of_table is not None and self._storage.ndim == 1:
             self._sampler.take_rows(of_table)
         try:
-            if new is not None:
-                index = self._write_in_turn(new)
-            else:
-                # The writer calls mark_update of this buffer, which calls that of the sampler. It
-                # adds the slots, which the caller's data shall not get.
-                index = writer.extend(data.copy())
+            # A writer calls mark_update of this buffer, which calls that of the sampler. It adds the
+            # slots, which the caller's data shall not get.
+            index = self._write_in_turn(new) if new is not None else writer.extend(data.copy())
         except BaseException:
             if of_table is not None:
                 self._sampler.take_rows(None)

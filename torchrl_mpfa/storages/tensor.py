@@ -22,8 +22,8 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import check_counts, generator_on
 from torchrl_mpfa.saving import allocate, dump, open_dump
-from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.entries import as_index
+from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.states import load_part, restore_rows, state_of
 
 if TYPE_CHECKING:
