@@ -184,8 +184,8 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
         if in_a_ring and of_table is not None and self._storage.ndim == 1:
             self._sampler.take_rows(of_table)
         try:
-            # A writer calls mark_update of this buffer, which calls that of the sampler. It adds the
-            # slots, which the caller's data shall not get.
+            # A writer calls mark_update of this buffer, which calls that of the sampler. It adds
+            # the slots, which the caller's data shall not get.
             index = self._write_in_turn(new) if new is not None else writer.extend(data.copy())
         except BaseException:
             if of_table is not None:
