@@ -1,6 +1,7 @@
 """Buffers that other processes write to: signals and priorities of all rows, or an error."""
 
 import multiprocessing
+import tempfile
 
 import pytest
 import torch
@@ -13,7 +14,15 @@ from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, S
 from torchrl_mpfa.samplers import TreeSampler
 from torchrl_mpfa.samplers.uniform import CERSampler
 
-STORAGES = [SignalTensorStorage, SignalMemmapStorage, LazyTensorStorage, LazyMemmapStorage]
+
+def make_packed(capacity):
+    return SignalMemmapStorage(capacity, scratch_dir=tempfile.mkdtemp())
+
+
+STORAGES = [
+    *(SignalTensorStorage, SignalMemmapStorage, make_packed),
+    *(LazyTensorStorage, LazyMemmapStorage),
+]
 
 
 def write(buffer, firsts):
