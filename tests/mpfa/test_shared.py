@@ -1,7 +1,6 @@
 """Buffers that other processes write to: signals and priorities of all rows, or an error."""
 
 import multiprocessing
-import tempfile
 
 import pytest
 import torch
@@ -14,15 +13,7 @@ from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, S
 from torchrl_mpfa.samplers import TreeSampler
 from torchrl_mpfa.samplers.uniform import CERSampler
 
-
-def make_packed(capacity):
-    return SignalMemmapStorage(capacity, scratch_dir=tempfile.mkdtemp())
-
-
-STORAGES = [
-    *(SignalTensorStorage, SignalMemmapStorage, make_packed),
-    *(LazyTensorStorage, LazyMemmapStorage),
-]
+STORAGES = [SignalTensorStorage, SignalMemmapStorage, LazyTensorStorage, LazyMemmapStorage]
 
 
 def write(buffer, firsts):
@@ -93,6 +84,17 @@ def test_rows_of_another_process_count_as_those_of_this_one(make_sampler, make_s
 
 def extend(buffer, first):
     buffer.extend(make_transitions(4, first=first))
+
+
+@pytest.mark.slow
+def test_rows_of_another_process_are_packed_in_the_files_of_this_one(tmp_path):
+    storage = SignalMemmapStorage(16, scratch_dir=tmp_path)
+    buffer = make_buffer(16, 8, storage=storage, sampler=MPFASampler())
+    buffer.share()
+    buffer.extend(make_transitions(10))
+    elsewhere(extend, buffer, 100)
+    assert buffer.sample().shape == (8,)
+    assert buffer[:]["observation"].flatten().tolist() == [*range(10), *range(100, 104)]
 
 
 @pytest.mark.slow
