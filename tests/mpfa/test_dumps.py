@@ -126,11 +126,14 @@ def test_writer_of_the_highest_values_is_restored(tmp_path):
     assert same(first[:].to_dict(), second[:].to_dict())
 
 
-@pytest.mark.parametrize("kind", [LazyMemmapStorage, SignalMemmapStorage])
-def test_rows_are_mapped_in_the_folder_of_the_storage_that_loads_them(dumped, tmp_path, kind):
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [(LazyMemmapStorage, "observation.memmap"), (SignalMemmapStorage, "float32.rows")],
+)
+def test_rows_are_mapped_in_the_folder_of_the_storage_that_loads_them(dumped, tmp_path, kind, file):
     buffer = make_buffer(16, storage=kind(16, scratch_dir=tmp_path / "rows"))
     buffer.loads(dumped)
-    assert (tmp_path / "rows/observation.memmap").exists()
+    assert (tmp_path / "rows" / file).exists()
     assert buffer[:]["observation"].flatten().tolist() == list(range(12))
 
 

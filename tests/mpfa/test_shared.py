@@ -87,6 +87,17 @@ def extend(buffer, first):
 
 
 @pytest.mark.slow
+def test_rows_of_another_process_are_packed_in_the_files_of_this_one(tmp_path):
+    storage = SignalMemmapStorage(16, scratch_dir=tmp_path)
+    buffer = make_buffer(16, 8, storage=storage, sampler=MPFASampler())
+    buffer.share()
+    buffer.extend(make_transitions(10))
+    elsewhere(extend, buffer, 100)
+    assert buffer.sample().shape == (8,)
+    assert buffer[:]["observation"].flatten().tolist() == [*range(10), *range(100, 104)]
+
+
+@pytest.mark.slow
 def test_rows_that_a_fork_kept_to_itself_are_an_error():
     buffer = make_buffer(16, 8, storage=SignalTensorStorage(16), sampler=MPFASampler())
     buffer.share()

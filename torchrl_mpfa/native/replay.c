@@ -196,6 +196,7 @@ typedef struct {
   char *rows;
   int64_t bytes;   // Of one row.
   int64_t number;  // 4 or 8: single or double precision, which must be finite; else 0.
+  int64_t stride;  // Bytes from one stored row to the next.
 } Column;
 
 // How often this thread waited for a page of a file.
@@ -206,12 +207,17 @@ int64_t waits(void) {
 
 // Have the system read the pages of rows all at once, where each would be waited for when it is touched.
 void ask(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
-  uintptr_t page = sysconf(_SC_PAGESIZE);
+  int64_t page = sysconf(_SC_PAGESIZE);
   if (outside(slots, n, end)) return;
-  for (int64_t c = 0; c < count; c++)
-    for (int64_t i = 0; columns[c].bytes && i < n; i++) {
-      uintptr_t row = (uintptr_t)(columns[c].stored + slots[i] * columns[c].bytes), first = row / page * page;
-      madvise((void *)first, row + columns[c].bytes - first, MADV_WILLNEED);
+  for (int64_t i = 0; i < n; i++)
+    for (int64_t c = 0, asked = 0, end_asked = 0; c < count; c++) {
+      if (columns[c].bytes == 0) continue;
+      int64_t row = (int64_t)columns[c].stored + slots[i] * columns[c].stride, row_end = row + columns[c].bytes;
+      // Entries of a file lie one after the other.
+      if (row >= asked && row_end <= end_asked) continue;
+      asked = row / page * page;
+      end_asked = (row_end + page - 1) / page * page;
+      madvise((void *)asked, end_asked - asked, MADV_WILLNEED);
     }
 }
 
@@ -219,18 +225,18 @@ void ask(const Column *columns, int64_t count, const int64_t *slots, int64_t n, 
 int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
   if (outside(slots, n, end)) return 1;
   for (int64_t c = 0; c < count; c++) {
-    int64_t b = columns[c].bytes;
+    int64_t b = columns[c].bytes, stride = columns[c].stride;
     if (b == 0) continue;
     const char *from = columns[c].stored;
     char *to = columns[c].rows;
     // A copy whose size the compiler knows takes one instruction.
-    if (b == 1) for (int64_t i = 0; i < n; i++) to[i] = from[slots[i]];
-    else if (b == 4) for (int64_t i = 0; i < n; i++) memcpy(to + 4 * i, from + 4 * slots[i], 4);
-    else if (b == 8) for (int64_t i = 0; i < n; i++) memcpy(to + 8 * i, from + 8 * slots[i], 8);
+    if (b == 1) for (int64_t i = 0; i < n; i++) to[i] = from[slots[i] * stride];
+    else if (b == 4) for (int64_t i = 0; i < n; i++) memcpy(to + 4 * i, from + slots[i] * stride, 4);
+    else if (b == 8) for (int64_t i = 0; i < n; i++) memcpy(to + 8 * i, from + slots[i] * stride, 8);
     else
       for (int64_t i = 0; i < n; i++) {
-        __builtin_prefetch(from + slots[i + AHEAD < n ? i + AHEAD : i] * b);
-        memcpy(to + i * b, from + slots[i] * b, b);
+        __builtin_prefetch(from + slots[i + AHEAD < n ? i + AHEAD : i] * stride);
+        memcpy(to + i * b, from + slots[i] * stride, b);
       }
   }
   return 0;
@@ -255,7 +261,8 @@ int64_t scatter(const Column *columns, int64_t count, const int64_t *slots, int6
   if (outside(slots, n, end)) return 1;
   for (int64_t c = 0; c < count; c++) {
     int64_t b = columns[c].bytes;
-    for (int64_t i = 0; b && i < n; i++) memcpy(columns[c].stored + slots[i] * b, columns[c].rows + i * b, b);
+    char *to = columns[c].stored;
+    for (int64_t i = 0; b && i < n; i++) memcpy(to + slots[i] * columns[c].stride, columns[c].rows + i * b, b);
   }
   return 0;
 }

@@ -15,8 +15,9 @@ from torch import Tensor
 from torchrl_mpfa.native import address, find_loops, is_plain, loops, opaque
 from torchrl_mpfa.storages.entries import INDEX_KEY, as_path, check_finite, named
 
-_WIDTH = 4
-"""Numbers of a column: addresses of what is stored and of the rows, bytes of a row, precision.
+_WIDTH = 5
+"""Numbers of a column: addresses of what is stored and of the rows, bytes of a row, its precision,
+and bytes from one stored row to the next.
 
 Precision is 4 or 8 where numbers must be finite, and 0 for all else."""
 _NUMBERS = {torch.float: 4, torch.double: 8}
@@ -86,10 +87,11 @@ class RowPlan:
             number = value.is_floating_point() and (*path, key) not in self._allowed
             place = len(self._columns)
             tree[key] = _Entry(value, value.shape[ndim:], value.dtype, number, place)
-            if self._by_c and is_plain(value):
+            if self._by_c and is_plain(value[:1]):
                 bytes_each = value.nbytes // len(value)
                 precision = _NUMBERS.get(value.dtype, 0) if number else 0
-                self._columns += (0, 0, bytes_each, precision)
+                stride = value.stride(0) * value.itemsize
+                self._columns += (0, 0, bytes_each, precision, stride)
             else:
                 self._by_c = False
         return _Branch(stored, len(stored.keys()), tree)

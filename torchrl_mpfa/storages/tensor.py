@@ -23,6 +23,8 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 from torchrl_mpfa.checks import check_counts, generator_on
 from torchrl_mpfa.saving import allocate, dump, open_dump
 from torchrl_mpfa.storages.entries import as_index
+from torchrl_mpfa.storages.packed import map_anew, pack
+from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.states import load_part, restore_rows, state_of
 
@@ -174,6 +176,11 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
     temporary files of its own. A load writes into the files once the state was found to fit; if
     the disk then fails, the storage is left half loaded.
 
+    With ``scratch_dir`` the entries of one type also lie side by side in one file, as in
+    ``scratch_dir/float32.rows``, so that a row from the disk is one page. What ``storage[:]``
+    returns then has the strides of such rows, and TensorDict cannot load the folder. With
+    ``shared_init`` each entry has a file, as in TorchRL.
+
     Further arguments: see :class:`SignalTensorStorage`.
 
     Args:
@@ -230,15 +237,24 @@ class SignalMemmapStorage(SignalTensorStorage, LazyMemmapStorage):
     def _init(self, data: Any) -> None:
         self._files_before = self._files()
         super()._init(data)
+        # With shared_init other processes look for TorchRL's files.
+        if self.scratch_dir and type(self._storage) is TensorDict and not self.shared_init:
+            self._storage = pack(self._storage, self.ndim, self.scratch_dir, self.existsok)
         # Texts and the like are kept in memory.
         leaves = tree_leaves(self._storage)
         entries = [entry for entry in leaves if isinstance(entry, MemoryMappedTensor)]
-        files = [e._filename or f"/proc/self/fd/{e._handler.fd}" for e in entries]
-        for file, entry in zip(files, entries, strict=True):
-            if entry.numel():  # One without numbers has no file.
-                allocate(file)
+        # One without numbers has no file.
+        for file in {_file_of(entry) for entry in entries if entry.numel()}:
+            allocate(file)
         for entry in entries:
             _expect_random(entry)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state, whose tensors share the files."""
+        state: dict[str, Any] = super().state_dict()
+        if type(self._storage) is TensorDict:
+            state["_storage"] = map_anew(self._storage).state_dict()
+        return state
 
     def _check_mapped(self) -> None:
         """Reject entries without numbers, which TensorDict maps at the first write alone."""
@@ -285,6 +301,10 @@ def rows_with(storage: Any, index: Any, info: dict[Any, Any]) -> tuple[Any, dict
     return storage.get(index), info
 
 
+def _file_of(entry: MemoryMappedTensor) -> str:
+    return str(entry._filename or f"/proc/self/fd/{entry._handler.fd}")
+
+
 def _is_batch(slots: Any) -> bool:
     """Return True if an index is one slot or more in a tensor on the CPU, ``[B]``."""
     return (
@@ -310,8 +330,9 @@ def _expect_random(entry: Tensor) -> None:
     Rows of a batch lie far apart: with a file larger than memory, all else that it read ahead would
     take the place of what is needed.
     """
-    start = entry.data_ptr() // mmap.PAGESIZE * mmap.PAGESIZE
-    size = entry.data_ptr() + entry.nbytes - start
+    memory = entry.untyped_storage()
+    start = memory.data_ptr() // mmap.PAGESIZE * mmap.PAGESIZE
+    size = memory.data_ptr() + memory.nbytes() - start
     ctypes.CDLL(None).madvise(c_void_p(start), c_size_t(size), mmap.MADV_RANDOM)
 
 

@@ -101,6 +101,6 @@ def test_the_system_reads_no_rows_ahead(tmp_path):
     flags = [
         after.splitlines()[0].split()
         for before, after in pairwise(mappings)
-        if f"{tmp_path}/observation.memmap" in before
+        if f"{tmp_path}/float32.rows" in before
     ]
     assert flags and all("rr" in names for names in flags)
