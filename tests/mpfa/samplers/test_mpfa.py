@@ -193,16 +193,17 @@ def test_another_fusion_or_level_counts_at_the_next_update(name, value):
     assert changed.sampler.weights == made.sampler.weights
 
 
-def test_of_several_batches_at_once_a_fusion_is_told_the_slots_of_the_first():
+@pytest.mark.parametrize(("refresh", "slots"), [(0.5, 4), (0.0, 8)])
+def test_of_several_batches_at_once_a_fusion_is_told_slots_as_often_as_it_counts(refresh, slots):
     class Told(Fusion):
         def weights(self, names, table, index):
             told.append(index)
             return torch.ones(len(names))
 
-    told, buffer = [], make_filled(16, 8, fusion=Told())
+    told, buffer = [], make_filled(16, 8, fusion=Told(), entropy_refresh=refresh)
     batch = write_signals(buffer.sample())
     buffer.update_tensordict_priority(batch, batches=2)
-    assert torch.cat(told).equal(batch["index"][:4])
+    assert torch.cat(told).equal(batch["index"][:slots])
 
 
 def test_weights_counted_over_the_batch_are_those_of_each_batch():

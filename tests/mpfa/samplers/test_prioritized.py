@@ -78,7 +78,8 @@ def test_slots_of_minus_one_are_skipped():
     sampler.update_priority(torch.tensor([-1, 2]), torch.tensor([9.0, 3.0]))
     assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
     sampler.update_priority(torch.tensor([-1]), torch.tensor([9.0]))
-    assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
+    sampler.update_priority(torch.tensor([-1, 0]), torch.tensor([9.0, 4.0]))
+    assert leaves(sampler, 4).tolist() == [4.0, 1.0, 3.0, 1.0]
 
 
 def test_one_number_may_serve_for_all_slots_and_a_column_for_a_row():
@@ -217,6 +218,7 @@ def test_torchrl_reads_the_trees_by_its_own_names():
     assert sampler._sum_tree[[0, 1, 3]].tolist() == [1.0, 0.5, 0.0]
     assert sampler._min_tree[1] == sampler._min_tree.query(0, 4) == 0.5
     assert sampler._min_tree[3] == torch.finfo(torch.double).max  # Nothing was written there.
+    assert sampler.batch_weights(4).isnan().tolist() == [False] * 3 + [True]
     assert sampler._sum_tree.query(0, 3) == 4.5
     with pytest.raises(ValueError, match="start must be 0, got 1"):
         sampler._sum_tree.query(1, 3)
@@ -272,7 +274,8 @@ def test_the_highest_ever_is_an_option_and_stays(settings):
     buffer = make_plain(4, **settings)
     buffer.extend(make_transitions(4))
     update(buffer, [0], [20.0])
-    update(buffer, [0], [0.5])
+    update(buffer, [0, 1], [0.5, 3.0])
+    assert buffer.sampler._max_priority == (20.0, 0)
     buffer.extend(make_transitions(4))
     assert buffer.sampler.priorities().tolist() == [20.0] * 4
 
