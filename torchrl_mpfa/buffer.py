@@ -353,6 +353,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 the part is the storage the buffer is empty.
         """
         sampler = self.sampler  # With delayed_init the parts are made here.
+        with self._write_lock:  # Reads what other processes wrote, which may be since the state.
+            pass
         self._check_state(state_dict)
         generator = None
         if state_dict["_rng"] is not None:

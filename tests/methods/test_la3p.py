@@ -5,7 +5,7 @@ import torch
 
 from tests.methods.replays import assert_shares, make_buffer
 from tests.mpfa.test_updates import make_learner
-from tests.mpfa.transitions import make_rows, make_transitions, seeded, set_signals
+from tests.mpfa.transitions import make_rows, make_transitions, rejected, seeded, set_signals
 from torchrl_mpfa import SignalSampler, run_updates
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches, uniform_halves
@@ -60,6 +60,12 @@ def test_batch_too_small_for_parts_and_other_sampler_are_rejected():
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
     with pytest.raises(TypeError, match="buffer must have an LA3PSampler, got SignalSampler"):
         next(la3p_batches(other))
+
+
+def test_priority_whose_inverse_would_overflow_a_sum_is_rejected():
+    sampler = LA3PSampler(1000, 1.0, 0.0, 0.0)
+    with rejected(sampler, ValueError, "priority must not be so low that its inverse overflows"):
+        sampler.update_priority([3], torch.tensor([1e-306], dtype=torch.double))
 
 
 def test_critics_part_finds_the_large_error_that_the_uniform_part_learned():

@@ -111,7 +111,9 @@ def test_weight_falls_while_too_many_transitions_are_far():
     near.buffer.sampler.policy_weight = 0.5
     list(near.select(near.buffer))
     assert near.buffer.sampler.policy_weight == pytest.approx(0.55)
-    assert next_weight(0.5, far=0.1, allowed=0.1, rate=0.2) == pytest.approx(0.6)
+    for weight, expected in ((0.5, 0.6), (0.9, 0.82)):
+        found = next_weight(weight, far=0.1, allowed=0.1, rate=0.2)
+        assert found == pytest.approx(expected)
 
 
 def test_loss_of_the_actor_is_that_of_the_formula():

@@ -66,3 +66,6 @@ def test_registered_class_makes_an_object_for_each_run() -> None:
     one, other = OwnSignals(["size"]), OwnSignals(["size"])
     assert one._functions["size"] is not other._functions["size"]
     assert len(OwnSignals(["td_error"])) == 0
+    batch = TensorDict({"observation": torch.rand(2, 3, requires_grad=True)}, [2])
+    one.write(None, batch)
+    assert not batch["signals", "size"].requires_grad

@@ -7,7 +7,11 @@ from concurrent.futures import ThreadPoolExecutor, wait
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage
+from torchrl.data import (
+    LazyTensorStorage,
+    TensorDictReplayBuffer,
+    TensorDictRoundRobinWriter,
+)
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.transforms import Compose, DoubleToFloat, MultiStepTransform, RewardScaling
@@ -89,6 +93,16 @@ def test_a_batch_from_before_the_buffer_was_emptied_is_stale(filled, times):
         buffer.update_tensordict_priority(batch.exclude("written_at"))
 
 
+def test_a_batch_from_before_a_load_of_fewer_transitions_is_stale():
+    buffer, smaller = make_filled(8), make_buffer(8)
+    batch = write_signals(buffer.sample())
+    batch["index"], batch["written_at"] = torch.tensor([1, 4, 6, 7]), torch.tensor([1.0, 4, 6, 7])
+    smaller.extend(make_transitions(1))
+    buffer.load_state_dict(smaller.state_dict())
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 4
+
+
 def test_without_the_time_of_writing_every_row_is_taken():
     buffer = make_filled(8)
     batch = write_signals(buffer.sample()).exclude("written_at")
@@ -140,6 +154,16 @@ def test_batch_has_the_entries_of_loss_and_update():
     assert batch["observation"].squeeze(1).equal(batch["index"].float())
     with pytest.warns(UserWarning, match="conflicting batch_sizes"):
         assert buffer.sample(3).batch_size == (3,)
+
+
+def test_generations_of_slots_are_those_that_torchrl_counts():
+    writers = [TensorDictRoundRobinWriter(track_generations=True) for _ in range(2)]
+    ours = make_buffer(8, 20, writer=writers[0])
+    theirs = TensorDictReplayBuffer(storage=LazyTensorStorage(8), writer=writers[1])
+    for buffer in (ours, theirs) * 3:
+        buffer.extend(make_transitions(5))
+    batch = ours.sample()
+    assert batch["index_generation"].equal(writers[1].generations_of(batch["index"]))
 
 
 def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
@@ -309,6 +333,8 @@ def filled_buffer(sampler):
 @pytest.mark.parametrize("kind", PRIORITIZED)
 def test_loop_that_never_updates_priorities_is_warned_once(kind, info):
     buffer = filled_buffer(PRIORITIZED[kind](20))
+    for _ in range(100):
+        buffer.sample(return_info=info)
     with pytest.warns(UserWarning, match=r"100 batches in a row .* update_tens") as found:
         for _ in range(300):
             buffer.sample(return_info=info)

@@ -159,6 +159,16 @@ def test_hindsight_learns_of_one_episode_at_a_time(kind):
         assert torch.tensor(places).diff().unique().tolist() == [1.0]
 
 
+def test_of_too_many_episodes_those_that_were_written_last_continue(monkeypatch):
+    monkeypatch.setattr("torchrl_mpfa.methods.reaper._UNDER_WAY", 2)
+    buffer = make_replay("reaper", capacity=CAPACITY, batch_size=8).buffer
+    robots = [Robot(number) for number in range(3)]
+    for robot in (*robots, *robots[1:]):
+        buffer.extend(robot.steps(1))
+        buffer.sampler._number(buffer.sampler.table)
+    assert buffer.sampler._episodes[:5].tolist() == [1, 2, 3, 2, 3]
+
+
 @pytest.mark.parametrize("load", [False, True])
 @pytest.mark.parametrize("at_a_time", [1, 4, 10])
 def test_reliability_is_that_of_one_episode_at_a_time(load, at_a_time):

@@ -239,13 +239,15 @@ def test_folder_with_code_in_it_is_rejected_and_not_executed(tmp_path):
     assert not trap.exists()
 
 
-@pytest.mark.parametrize("way", ["extend", "load another"])
+@pytest.mark.parametrize("way", ["extend", "slots", "load another"])
 def test_state_whose_data_were_overwritten_since_is_rejected(pair, way):
     other, buffer = pair
     buffer.extend(make_transitions(2))
     state, copy = buffer.state_dict(), snapshot(buffer)
     if way == "extend":
         buffer.extend(make_transitions(8, rewards=[50.0] * 8))
+    elif way == "slots":
+        buffer[torch.tensor([1])] = make_transitions(1, rewards=[50.0])
     else:
         buffer.load_state_dict(other)
         while buffer.state_dict()["_time"] < copy["_time"]:
@@ -255,6 +257,12 @@ def test_state_whose_data_were_overwritten_since_is_rejected(pair, way):
             reader.load_state_dict(state)
     buffer.load_state_dict(copy)
     assert same(copy, snapshot(buffer))
+
+
+def test_number_of_samples_after_which_rows_are_consumed_is_restored(pair):
+    other, buffer = pair
+    buffer.load_state_dict({**deepcopy(other), "_consume_after_n_samples": 3})
+    assert buffer.state_dict()["_consume_after_n_samples"] == 3
 
 
 def test_state_is_loaded_several_times_before_a_write(pair):

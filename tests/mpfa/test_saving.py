@@ -10,8 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
+from tests.mpfa.compiled import fail_with
 from tests.mpfa.transitions import Trap, same
 from torchrl_mpfa.saving import (
+    check_saved,
     check_saved_numbers,
     load_safely,
     save_atomically,
@@ -51,6 +53,25 @@ def test_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch, kind, ren
     assert path.read_bytes() == before
     assert path.read_text(encoding="utf-8") == "α\n" if text else load_safely(path) == {"step": 1}
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_file_is_on_the_disk_before_it_takes_the_place_of_the_old_one(tmp_path, monkeypatch):
+    done = []
+    for name in ("fsync", "replace"):
+        call = getattr(os, name)
+        monkeypatch.setattr(
+            os, name, lambda *args, name=name, call=call: (done.append(name), call(*args))
+        )
+    save_atomically({"step": 1}, tmp_path / "state.pt")
+    assert done == ["fsync", "replace"]
+
+
+def test_leftover_of_another_users_process_stays(tmp_path, monkeypatch):
+    leftover = tmp_path / ".state.pt.1-0123456789abcdef.tmp"
+    leftover.write_bytes(b"being written")
+    monkeypatch.setattr(os, "kill", fail_with(PermissionError()))
+    save_atomically({"step": 1}, tmp_path / "state.pt")
+    assert leftover.exists()
 
 
 def test_save_removes_the_leftovers_of_killed_processes_alone(tmp_path):
@@ -134,6 +155,21 @@ def test_flipped_bit_is_noticed_or_harmless(tmp_path):
             assert "state.pt is" in str(error)
             noticed += 1
     assert noticed > 190
+
+
+def test_flipped_bit_at_the_begin_of_a_large_file_is_noticed(tmp_path):
+    path = tmp_path / "state.pt"
+    save_atomically({"a": torch.zeros(2**19)}, path)  # Of two megabytes.
+    damaged = bytearray(path.read_bytes())
+    damaged[2**19] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match="its checksum is wrong"):
+        load_safely(path)
+
+
+def test_saved_value_of_another_type_is_rejected():
+    with pytest.raises(ValueError, match="'strict' of the saved sampler must be True, got 1"):
+        check_saved("sampler", {"strict": 1}, strict=True)
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.tensor([0.0, torch.inf])])

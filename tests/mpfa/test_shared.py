@@ -1,6 +1,7 @@
 """Buffers that other processes write to: signals and priorities of all rows, or an error."""
 
 import multiprocessing
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -80,6 +81,63 @@ def test_rows_of_another_process_count_as_those_of_this_one(make_sampler, make_s
         shared.update_tensordict_priority(before)
         assert shared.stale_updates == 8
         assert train_rounds(shared, 5).shape == train_rounds(alone, 5).shape
+
+
+def write_past(buffer, first):
+    """Write as another process does: the sampler of this one does not hear of it."""
+    slots = (buffer.writer._cursor + torch.arange(4)) % 16
+    buffer.storage.set(slots, make_transitions(4, first=first).set("index", slots))
+    buffer.writer._cursor, buffer.writer._write_count = int(slots[-1]) + 1 & 15, first + 4
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_rows_that_the_sampler_did_not_hear_of_are_read_once_and_in_their_order(count):
+    shared, alone = (
+        make_buffer(16, 8, storage=SignalMemmapStorage(16), max_priority_within_buffer=False)
+        for _ in range(2)
+    )
+    shared.share()
+    for buffer in (shared, alone):
+        buffer.extend(make_transitions(8))
+        train_rounds(buffer, 3)
+    saved = shared.state_dict()
+    for first in range(8, 4 * count, 4):
+        write_past(shared, first)
+        alone.extend(make_transitions(4, first=first))
+    if count > 2:
+        with pytest.raises(ValueError, match="written to since"):
+            shared.load_state_dict(saved)
+    for buffer in (shared, alone):
+        with buffer._write_lock:  # By whom it is held the rows are read once as well.
+            for _ in range(2):
+                buffer.extend(make_transitions(4, first=4 * count))
+    assert same(shared.distributions(), alone.distributions())
+    if count == 2:
+        assert shared.sampler.table.writes == alone.sampler.table.writes
+    write_past(shared, 4 * count + 8)
+    alone.extend(make_transitions(4, first=4 * count + 8))
+    shared.share(False)
+    assert same(shared.distributions(), alone.distributions())
+    assert train_rounds(shared, 3).equal(train_rounds(alone, 3))
+
+
+def test_newest_transition_may_be_of_another_process():
+    buffer = make_buffer(16, 8, storage=SignalMemmapStorage(16), sampler=CERSampler())
+    buffer.share()
+    buffer.extend(make_transitions(8))
+    write_past(buffer, 8)
+    assert buffer.sample()["index"][0] == 11
+
+
+def test_an_error_of_reading_leaves_the_lock_to_others():
+    buffer = make_buffer(16, 8)
+    buffer.share()
+    buffer.extend(make_transitions(8))
+    write_past(buffer, 8)
+    with pytest.raises(RuntimeError, match="not in shared memory"):
+        buffer.sample()
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(buffer._write_lock._lock.acquire, False).result()
 
 
 def extend(buffer, first):

@@ -155,6 +155,18 @@ def test_rejected_write_changes_nothing_in_transforms(kind, bad):
     assert same(held(buffer), held(other))
 
 
+def test_attribute_that_a_rejected_write_added_is_gone():
+    class Adds(Transform):
+        def _inv_call(self, tensordict):
+            self.added = True
+            return tensordict
+
+    buffer = make_buffer(60, transform=Adds())
+    with rejected(buffer, ValueError, "must be finite"):
+        buffer.extend(spoiled(BAD["NaN in what is stored"]))
+    assert not hasattr(buffer.transform[0], "added")
+
+
 @pytest.mark.parametrize("own", [True, False], ids=["own generator", "PyTorch's"])
 def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers(own):
     def make_hindsight():
@@ -226,11 +238,13 @@ def test_emptied_buffer_keeps_settings_and_no_waiting_steps(kind):
     buffer, fresh = make(kind), make(kind)
     with rejected(buffer, ValueError, "must be finite"):  # It leaves copies in the transform.
         buffer.extend(spoiled(BAD["NaN in what is kept"]))
-    buffer.extend(steps(20, 4))
-    if kind == "n-step":
-        for each in (buffer, fresh):
-            each.transform[0].n_steps = 2
-    buffer.empty()
+    for first in (20, 30):
+        for begin in (first, first + 4):
+            buffer.extend(steps(begin, 4))
+        if kind == "n-step":
+            for each in (buffer, fresh):
+                each.transform[0].n_steps = 2
+        buffer.empty()
     found = [each.extend(steps(0, 8)).tolist() for each in (buffer, fresh)]
     assert found[0] == found[1]
     assert torch.equal(buffer[:]["observation"], fresh[:]["observation"])

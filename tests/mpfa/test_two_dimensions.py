@@ -78,6 +78,14 @@ def test_priorities_by_hand_take_places_too():
         buffer.update_priority(torch.tensor([[0, 3]]), torch.ones(1))
 
 
+def test_first_priorities_are_those_of_their_steps():
+    buffer, data = make_deep_buffer(), make_trajectories()
+    data["td_error"] = data["observation"].squeeze(-1)
+    buffer.extend(data)
+    found = buffer.sampler.priorities()[: ENVS * STEPS].reshape(STEPS, ENVS)
+    torch.testing.assert_close(found.T.float(), data["td_error"] + 0.05)
+
+
 def test_adding_a_step_of_every_environment_equals_extending_by_it():
     one, many = make_deep_buffer(), make_deep_buffer()
     data = make_trajectories()

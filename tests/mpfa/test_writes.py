@@ -10,6 +10,7 @@ from torchrl.data import TensorDictMaxValueWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.transforms import MultiStepTransform
 
+from tests.mpfa.compiled import fail_with
 from tests.mpfa.transitions import make_buffer, rejected, same, seeded, snapshot, train_rounds
 from torchrl_mpfa import (
     FixedFusion,
@@ -21,6 +22,7 @@ from torchrl_mpfa import (
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.methods.reaper import ReaPERSampler
 from torchrl_mpfa.samplers import TreeSampler
+from torchrl_mpfa.storages.plan import NewRows
 
 CAPACITY = 8
 
@@ -85,6 +87,10 @@ BAD = {
         r"\('next', 'observation'\) is missing in the transitions",
     ),
     "unknown entry": (changed("loc", torch.ones(2, 2)), r"'loc' is not in the storage"),
+    "unknown entries": (
+        changed("more", TensorDict({"loc": torch.ones(2, 2)}, [2])),
+        r"'more' is not in the storage",
+    ),
     "entries in place of a tensor": (
         changed("action", TensorDict({"a": torch.ones(2, 2)}, [2])),
         r"'action' must be a tensor, got TensorDict",
@@ -156,6 +162,16 @@ def test_a_rejected_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kin
     for value in (50.0, 51.0, 52.0):
         buffer.extend(make_full_transitions(1, value))
     assert sorted(buffer[:]["observation"][:, 0].tolist()) == [4, 50, 51, 52]
+
+
+def test_rows_of_a_write_that_failed_are_not_those_of_the_next(monkeypatch):
+    buffer = make_buffer(CAPACITY)
+    buffer.extend(make_full_transitions(CAPACITY))
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no room"):
+        patch.setattr(NewRows, "write", fail_with(OSError("no room")))
+        buffer.extend(make_full_transitions(1, 9.0))
+    buffer.mark_update(torch.tensor([3]))
+    assert buffer.rewards().tolist() == [1.0] * CAPACITY
 
 
 def test_an_empty_batch_is_written_as_nothing(buffer):
@@ -384,6 +400,11 @@ def with_hindsight():
 
 def with_steps():
     return make_buffer(32, transform=MultiStepTransform(n_steps=2, gamma=0.9, done_keys=["done"]))
+
+
+def test_trajectories_of_one_length_have_no_padding_in_two_dimensions():
+    buffer = of_two_dimensions()
+    assert len(buffer.extend(padded([3, 3]))) == 6
 
 
 @pytest.mark.parametrize("make", [of_two_dimensions, with_hindsight, with_steps])

@@ -208,8 +208,13 @@ class ReadTree:
         self._trees, self._minimum = trees, minimum
 
     def __getitem__(self, slots: Any) -> Tensor:
-        leaves = self._trees.leaves(torch.as_tensor(slots).reshape(-1))
-        return leaves.where(~leaves.signbit(), _MOST) if self._minimum else leaves
+        slots = torch.as_tensor(slots).reshape(-1)
+        leaves = self._trees.leaves(slots)
+        if not self._minimum:
+            return leaves
+        # TorchRL's tree of sums has 0.0 where nothing was written.
+        empty = leaves.signbit() | self._trees.priorities[slots].isnan()
+        return leaves.masked_fill(empty, _MOST)
 
     def query(self, start: int, end: int) -> Any:
         """Return the sum or minimum of the leaves from ``start``, which is 0, to before ``end``."""

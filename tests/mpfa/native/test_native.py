@@ -36,6 +36,14 @@ def test_a_sampler_made_with_loops_says_that_it_needs_them(monkeypatch):
         buffer.sample()
 
 
+@pytest.mark.parametrize(
+    "values", [torch._neg_view(torch.arange(3)), torch.arange(6)[::2], torch.arange(3).int()]
+)
+def test_numbers_that_do_not_lie_as_they_are_named_have_no_address(values):
+    with pytest.raises(TypeError, match=r"values must be a plain tensor of torch\.int64"):
+        native.address(values, torch.long)
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_statistics_say_which_path_a_buffer_takes(path, monkeypatch):
     take(path, monkeypatch)
@@ -107,6 +115,9 @@ def test_a_storage_larger_than_its_sampler_samples_no_slot_outside_of_it(monkeyp
     sampler.mark_update(torch.arange(10), storage=storage)
     slots, _ = sampler.sample(storage, 1000)
     assert slots.max() < 10
+    signals = {name: torch.ones(2) for name in ("td_error", "action_gradient")}
+    with pytest.raises(IndexError, match="index out of range"):
+        sampler.update_signals(torch.tensor([3, 30]), signals, storage=storage)
 
 
 def test_signals_on_another_device_are_learned_from(monkeypatch, second_device):

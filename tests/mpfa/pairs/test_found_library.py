@@ -13,6 +13,7 @@ import pytest
 from tests.mpfa.compiled import fail_with
 from tests.mpfa.transitions import make_buffer, make_transitions, write_signals
 from torchrl_mpfa import native
+from torchrl_mpfa.native import build
 from torchrl_mpfa.native.build import compile_library, library_name
 
 pytestmark = pytest.mark.usefixtures("own_library")
@@ -42,6 +43,14 @@ def test_without_a_compiler_pytorch_trains(monkeypatch, tmp_path):
     buffer.extend(make_transitions(16))
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
     assert list((tmp_path / "torchrl_mpfa").iterdir()) == []
+
+
+@pytest.mark.parametrize("part", ["SOURCE", "_OPTIONS"])
+def test_name_of_the_library_follows_from_source_and_options(part, monkeypatch, tmp_path):
+    before, other = library_name(), tmp_path / "replay.c"
+    other.write_bytes(build.SOURCE.read_bytes() + b"\n")
+    monkeypatch.setattr(build, part, {"SOURCE": other, "_OPTIONS": ("-O2",)}[part])
+    assert library_name() != before
 
 
 def test_a_folder_of_caches_that_is_no_folder_leaves_it_to_pytorch(monkeypatch, tmp_path):

@@ -119,6 +119,10 @@ def test_a_count_that_is_not_finite_is_rejected_and_changes_nothing():
 # Eq. 22 with a factor that follows the buffer.
 
 
+def test_boost_of_one_may_follow_the_buffer():
+    assert PositiveBoost(boost=1.0, target_share=0.4).factor(torch.tensor(0.1)) == 1.0
+
+
 def phi_by_hand(rewards, level, target, highest):
     positive = sum(reward > level for reward in rewards)
     if positive == 0:
@@ -127,7 +131,7 @@ def phi_by_hand(rewards, level, target, highest):
     return min(max(ratio, 1.0), highest)
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0, 9.0])
+@pytest.mark.parametrize("level", [-1.0, 0.0, 1.0, 9.0])
 def test_the_rarer_positive_transitions_are_the_larger_is_phi(level):
     rewards = torch.randn(40, generator=seeded(2))
     boost = PositiveBoost(boost=6.0, target_share=0.4)

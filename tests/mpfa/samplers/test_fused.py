@@ -1,11 +1,13 @@
 """A signal, a fusion and an adjustment of a user's own, without a change of the package."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.mpfa.transitions import make_buffer, make_transitions, rejected
-from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal
+from torchrl_mpfa import REWARD, TD_ERROR, Adjustment, FixedFusion, Fusion, Signal, SignalSampler
 from torchrl_mpfa.samplers.table import SignalTable
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
@@ -65,12 +67,16 @@ def priorities(buffer):
     return buffer.sampler.priorities(torch.arange(len(buffer))).tolist()
 
 
-def test_own_signals_go_from_the_batch_to_the_priority():
-    buffer = make_own_buffer()
+@pytest.mark.parametrize(
+    ("function", "expected"), [(None, [3.0, 5.25]), (torch.square, [4.0, 20.25])]
+)
+def test_own_signals_go_from_the_batch_to_the_priority(function, expected):
+    novelty = replace(NOVELTY, priority=function)
+    buffer = make_own_buffer(signals=[TD_ERROR, novelty, REWARD, SURPRISE])
     buffer.extend(make_own_transitions(8))
     update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
-    # 4/4 + 2/2 + 2^2/4 and 0 + 6/2 + 3^2/4
-    assert priorities(buffer)[2:4] == pytest.approx([3.0, 5.25])
+    # 4/4 + 2/2 + 2^2/4 and 0 + 6/2 + 3^2/4, or 2^2/2 and 6^2/2
+    assert priorities(buffer)[2:4] == pytest.approx(expected)
 
 
 def test_an_own_fusion_and_an_own_adjustment_do_their_work():
@@ -85,6 +91,18 @@ def test_an_own_fusion_and_an_own_adjustment_do_their_work():
     buffer.storage.signal_table.count_replay(torch.tensor([3]))
     update(buffer, [2, 3], td_error=[4.0, 0.5], novelty=[2.0, 60.0])
     assert priorities(buffer)[2:4] == pytest.approx([2.0, 1e-6])
+
+
+def test_an_own_signal_that_is_named_reward_is_read_where_it_says():
+    own = Signal("reward", key="mine")
+    assert SignalSampler(8, 0.6, 0.4, signals=[own], reward_key="r").signals == (own,)
+
+
+def test_highest_priority_that_was_adjusted_to_below_eps_is_zero_without_it():
+    buffer = make_own_buffer(adjustments=[CappedReplays(-1)], eps=0.5)
+    buffer.extend(make_own_transitions(8))
+    update(buffer, list(range(8)), td_error=[1.0] * 8, novelty=[1.0] * 8)
+    assert buffer.sampler.default_priority == buffer.sampler._max_priority[0] == 0.0
 
 
 @pytest.mark.parametrize(

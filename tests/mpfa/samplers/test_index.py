@@ -1,5 +1,7 @@
 """The index of a batch in all its forms: read, or rejected by name before anything changes."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -27,6 +29,14 @@ def test_an_index_of_nothing_is_no_slot_in_any_form(index):
     slots = as_slots(index)
     assert slots.dtype is torch.long
     assert slots.shape == (0,)
+
+
+def test_places_of_what_was_not_stored_are_no_slot_and_others_are_within_the_shape():
+    storage = SimpleNamespace(_total_shape=torch.Size([2, 3]))
+    assert as_slots(torch.tensor([[-1, -1], [1, 2]]), storage).tolist() == [-1, 5]
+    for outside in ([2, 0], [0, 3], [-1, 0]):
+        with pytest.raises(IndexError, match=r"within the storage's shape \[2, 3\], got"):
+            as_slots(torch.tensor([outside]), storage)
 
 
 def test_part_of_an_ensembles_batch_updates_the_priorities_of_its_rows():

@@ -181,6 +181,31 @@ def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten
     assert asked == expected
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("fusion", FixedFusion({"td_error": 1.0})), ("positive_above", 9.0)]
+)
+def test_another_fusion_or_level_counts_at_the_next_update(name, value):
+    changed, made = make_filled(16), make_filled(16, **{name: value})
+    train_rounds(changed, 1)
+    setattr(changed.sampler, name, value)
+    for buffer in (changed, made):
+        train_rounds(buffer, 1)
+    assert changed.sampler.weights == made.sampler.weights
+
+
+@pytest.mark.parametrize(("refresh", "slots"), [(0.5, 4), (0.0, 8)])
+def test_of_several_batches_at_once_a_fusion_is_told_slots_as_often_as_it_counts(refresh, slots):
+    class Told(Fusion):
+        def weights(self, names, table, index):
+            told.append(index)
+            return torch.ones(len(names))
+
+    told, buffer = [], make_filled(16, 8, fusion=Told(), entropy_refresh=refresh)
+    batch = write_signals(buffer.sample())
+    buffer.update_tensordict_priority(batch, batches=2)
+    assert torch.cat(told).equal(batch["index"][:slots])
+
+
 def test_weights_counted_over_the_batch_are_those_of_each_batch():
     # Without this, one batch would weigh for all that follow until enough was written.
     buffer = make_buffer(8, fusion=EntropyFusion(population="batch"))

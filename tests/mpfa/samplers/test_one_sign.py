@@ -76,10 +76,13 @@ def test_the_mean_of_the_buffer_reaches_the_boost():
         "adjustments": [PositiveBoost(boost=2.0, bound="none")],
         "fusion": FixedFusion({"td_error": 1.0}),
     }
-    buffer = make_buffer(4, positive_above="mean", eps=0.0, **parts)
+    buffer = make_buffer(5, positive_above="mean", eps=0.0, entropy_refresh=1.0, **parts)
     buffer.extend(make_transitions(4, rewards=[-1.0, -3.0, -5.0, -7.0]))
     set_signals(buffer, td_error=torch.ones(4), action_gradient=torch.ones(4))
-    assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0]
+    assert buffer.sampler.priorities()[:4].tolist() == [2.0, 2.0, 1.0, 1.0]
+    buffer.extend(make_transitions(1, rewards=[100.0]))  # The mean is counted as often as weights.
+    set_signals(buffer, td_error=torch.ones(5), action_gradient=torch.ones(5))
+    assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0, 2.0]
 
 
 def test_the_level_of_a_method_is_that_of_its_sampler_also_after_a_change_of_capacity():

@@ -78,7 +78,8 @@ def test_slots_of_minus_one_are_skipped():
     sampler.update_priority(torch.tensor([-1, 2]), torch.tensor([9.0, 3.0]))
     assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
     sampler.update_priority(torch.tensor([-1]), torch.tensor([9.0]))
-    assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
+    sampler.update_priority(torch.tensor([-1, 0]), torch.tensor([9.0, 4.0]))
+    assert leaves(sampler, 4).tolist() == [4.0, 1.0, 3.0, 1.0]
 
 
 def test_one_number_may_serve_for_all_slots_and_a_column_for_a_row():
@@ -129,9 +130,10 @@ def test_an_empty_buffer_and_priorities_of_zero_cannot_be_sampled():
     with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
         sampler.sample(LazyTensorStorage(4), 2)
     storage = filled(sampler, 2, 4)
-    sampler.update_priority(torch.arange(2), 0.0)
-    with pytest.raises(RuntimeError, match=r"every priority must be positive.* sum of 0.0"):
-        sampler.sample(storage, 2)
+    for slot in range(2):
+        sampler.update_priority(slot, 0.0)
+        with pytest.raises(RuntimeError, match=r"every priority must be positive.* lowest of 0.0"):
+            sampler.sample(storage, 2)
 
 
 def test_a_batch_of_one_can_be_sampled_from_a_buffer_of_one():
@@ -184,6 +186,9 @@ def test_the_highest_mass_that_there_is_does_not_leave_the_filled_slots(monkeypa
     highest = torch.full((3,), 1.0 - 2.0**-53, dtype=torch.double)
     monkeypatch.setattr(sampler, "_mass", lambda count: highest.clone())
     assert sampler.sample(storage, 3)[0].tolist() == [28] * 3
+    # The highest share of the last of equal parts is rounded up to one.
+    sampler.stratified, highest = True, torch.ones_like(highest)
+    assert sampler._uniform(29, 3).tolist() == [28] * 3
 
 
 @pytest.mark.parametrize("count", [3, 40_000])
@@ -208,6 +213,8 @@ def test_torchrl_reads_the_trees_by_its_own_names():
     assert sampler._tree_argmax()[1] == 2
     assert sampler._sum_tree[[0, 1, 3]].tolist() == [1.0, 0.5, 0.0]
     assert sampler._min_tree[1] == sampler._min_tree.query(0, 4) == 0.5
+    assert sampler._min_tree[3] == torch.finfo(torch.double).max  # Nothing was written there.
+    assert sampler.batch_weights(4).isnan().tolist() == [False] * 3 + [True]
     assert sampler._sum_tree.query(0, 3) == 4.5
     with pytest.raises(ValueError, match="start must be 0, got 1"):
         sampler._sum_tree.query(1, 3)
@@ -247,13 +254,22 @@ def test_fresh_rows_have_the_highest_priority_whatever_its_slot(slot):
     assert buffer.sampler.default_priority == 9.0
 
 
-def test_the_highest_ever_is_an_option_and_stays():
-    buffer = make_plain(4, max_priority_within_buffer=False)
+@pytest.mark.parametrize("settings", [{"max_priority_within_buffer": False}, {"alpha": 0.0}])
+def test_the_highest_ever_is_an_option_and_stays(settings):
+    """TorchRL keeps it where all slots are sampled alike, too."""
+    buffer = make_plain(4, **settings)
     buffer.extend(make_transitions(4))
     update(buffer, [0], [20.0])
-    update(buffer, [0], [0.5])
+    update(buffer, [0, 1], [0.5, 3.0])
+    assert buffer.sampler._max_priority == (20.0, 0)
     buffer.extend(make_transitions(4))
     assert buffer.sampler.priorities().tolist() == [20.0] * 4
+
+
+def test_priority_of_zero_that_was_learned_is_the_highest_where_all_are_zero():
+    sampler = TreeSampler(2, 1.0, 0.4, 0.0, max_priority_within_buffer=True)
+    sampler.update_priority(torch.arange(2), 0.0)
+    assert sampler.default_priority == 0.0
 
 
 @pytest.mark.parametrize("within", [True, False])
@@ -277,7 +293,8 @@ def test_priority_from_torchrls_buffer_does_not_count_as_learned():
         batch_size=2,
     )
     buffer.extend(torch.arange(4))
-    buffer.update_priority(torch.tensor([0]), torch.tensor([0.37]))
+    for _ in range(2):  # A priority that was learned stays so, whatever it is.
+        buffer.update_priority(torch.tensor([0]), torch.tensor([0.37]))
     buffer.extend(torch.arange(2))
     buffer.update_priority(torch.tensor([4, 5]), torch.tensor([0.37, 0.37]))
     buffer.update_priority(torch.tensor([0]), torch.tensor([0.2]))

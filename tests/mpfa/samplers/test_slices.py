@@ -320,6 +320,17 @@ def test_a_batch_can_leave_the_ends_as_they_were_stored():
     assert batch["next", "done"].equal(stored["next", "done"])
 
 
+def test_ends_within_a_slice_stay_in_its_batch():
+    storage = SignalTensorStorage(8)
+    sampler = SignalSliceSampler(8, ALPHA, BETA, slice_len=4, end_key="never")
+    buffer, still = make_buffer(8, 8, storage=storage, sampler=sampler), torch.zeros(8, 1)
+    done = torch.arange(8).unsqueeze(1) % 2 == 1
+    after = {"observation": still, "reward": still, "done": done}
+    buffer.extend(TensorDict({"observation": still, "never": still.bool(), "next": after}, [8]))
+    batch = buffer.sample()
+    assert batch["next", "done"][done[batch["index"]]].all()
+
+
 @BOTH_PATHS
 @pytest.mark.parametrize("strict_length", [True, False])
 def test_updates_of_an_iteration_learn_from_whole_slices(strict_length):

@@ -146,9 +146,20 @@ def test_get_equals_plain_indexing(make_storage, index):
     for key in ((), "long", "walkers"):
         assert found[key].batch_size == expected[key].batch_size
     assert same(found.to_dict(), expected.to_dict())
+    assert found.device == expected.device
     if not isinstance(index, slice):
         found["observation"].fill_(-1)
         assert (ours[:]["observation"] >= 0).all() or isinstance(index, int)
+
+
+def test_entries_that_were_replaced_or_added_since_are_read():
+    storage, slots = SignalTensorStorage(4), torch.tensor([1])
+    storage.set(torch.arange(4), make_transitions(4))
+    assert storage.get(slots)["observation"] == 1
+    storage._storage["observation"] = torch.full((4, 1), 7.0)
+    assert storage.get(slots)["observation"] == 7
+    storage._storage["more"] = torch.ones(4)
+    assert storage.get(slots)["more"] == 1
 
 
 def test_reading_a_slot_that_was_never_written_is_an_error(make_storage):
@@ -177,12 +188,21 @@ def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
         buffer.extend(make_transitions(1, rewards=[1.0]))
 
 
+def test_buffer_of_a_storage_that_was_filled_without_slots_writes_them():
+    storage = SignalTensorStorage(8)
+    storage.set(torch.arange(8), make_transitions(8))
+    slots = make_buffer(8, storage=storage).extend(make_transitions(2))
+    assert storage.get(slots)["index"].equal(slots)
+
+
 def test_rows_that_are_written_out_of_order_count_as_in_torchrl():
     ours, theirs = make_buffer(8).storage, LazyTensorStorage(8)
     rows = make_transitions(1).set("index", torch.zeros(1, dtype=torch.long))
     for storage in (ours, theirs):
         for slot in (0, 5, 5):
+            before = int(storage._mutation_revision)
             storage.set(torch.tensor([slot]), rows.clone())
+            assert int(storage._mutation_revision) > before  # TorchRL's caches of rows end there.
     assert len(ours) == len(theirs) == 3
 
 
