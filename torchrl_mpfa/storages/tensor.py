@@ -25,7 +25,6 @@ from torchrl_mpfa.saving import allocate, dump, open_dump
 from torchrl_mpfa.storages.entries import as_index
 from torchrl_mpfa.storages.packed import map_anew, pack
 from torchrl_mpfa.storages.plan import RowPlan
-from torchrl_mpfa.storages.plan import RowPlan
 from torchrl_mpfa.storages.states import load_part, restore_rows, state_of
 
 if TYPE_CHECKING:
