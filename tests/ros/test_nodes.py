@@ -83,7 +83,7 @@ class Bench:
         self.send(self.start, task.start)
         assert self.until(lambda: math.dist(self.pose[:2], task.start[:2]) < 0.01, 20.0)
         self.touched, end = False, self.now + 50.0
-        self.send(self.goal, (*task.goal, 0.0))
+        self.send(self.goal, (*task.goal, 0.0), self.now)
 
         def near() -> bool:
             return math.dist(self.pose[:2], task.goal) <= 0.5
@@ -91,8 +91,9 @@ class Bench:
         self.until(lambda: near() or self.touched or self.now > end, 120.0)
         return near() and not self.touched
 
-    def send(self, publisher: Any, pose: tuple[float, float, float]) -> None:
+    def send(self, publisher: Any, pose: tuple[float, float, float], now: float = 0.0) -> None:
         message = PoseStamped()
+        message.header.stamp = rclpy.time.Time(seconds=now).to_msg()
         message.header.frame_id = "odom"
         write_pose(message.pose, pose)
         publisher.publish(message)

@@ -65,7 +65,7 @@ def scan(time: float) -> Any:
 def goal(frame: str, x: float = 4.0) -> Any:
     facing = names(x=0.0, y=0.0, z=math.sin(0.5), w=math.cos(0.5))
     pose = names(position=names(x=x, y=0.0), orientation=facing)
-    return names(header=names(frame_id=frame), pose=pose)
+    return names(header=names(frame_id=frame, stamp=stamp(0.0)), pose=pose)
 
 
 def transform(time: float, x: float = 0.0) -> Any:
@@ -180,7 +180,10 @@ def test_a_goal_before_the_first_odometry_waits_for_it(
     node._on_goal(goal(frame))
     node._tick()
     assert world.sent == [STANDS]  # One stop, then none.
-    assert world.logged[-1][1] == f"goal in frame {frame!r}: there was no odometry yet"
+    assert (
+        world.logged[-1][1]
+        == f"goal in frame {frame!r}: there was no odometry as new as the goal yet"
+    )
     assert feed(node, world, 10.0) == DRIVES
     assert node.controller.pilot.goal == (4.0, 0.0)
 

@@ -29,6 +29,7 @@ from mpfa_envs.ros.messages import (
     transformed,
     yaw,
 )
+from mpfa_envs.ros.rehearsal import rehearse
 from mpfa_envs.worlds.world import World
 
 PARAMETERS: Final[dict[str, Any]] = {
@@ -69,7 +70,8 @@ class PolicyNode(Node):
             self.declare_parameter(name, default)
         value = self._value
         options = {name: value(name) for name in ("silent", "map_size")}
-        pilot = Pilot.load(
+        load = partial(
+            Pilot.load,
             value("policy"),
             robot=value("robot") or None,
             pace=value("pace") or None,
@@ -80,6 +82,9 @@ class PolicyNode(Node):
             goal_radius=value("goal_radius") or None,
             **options,
         )
+        # Loops that the first decision compiled would hold up the checks for seconds.
+        rehearse(load())
+        pilot = load()
         rate = check_positive("rate", value("rate"))
         limits = {n: value(n) for n in ("stop_distance", "scan_timeout", "odometry_timeout")}
         self.controller = Controller(pilot, **limits, check_period=1.0 / rate)
@@ -92,6 +97,7 @@ class PolicyNode(Node):
         self._plan: tuple[World, Pose, str] | None = None
         self._turns = value("goal_heading") and pilot.turns_on_the_spot
         self._waits = ""
+        self._felt, self._known_since = -math.inf, -math.inf
         self._stamp, self._stamped_at = -math.inf, -math.inf
         self._reason = ""
         self._transforms = self._listen()
@@ -137,7 +143,8 @@ class PolicyNode(Node):
             self._goal, self._waits = None, ""
             there = f"from frame {last!r} to {self._odometry_frame!r}"
             self.controller.aim(None, f"odometry jumped: {there}")
-        self.controller.feel(*odometry_of(message), self._time_of(message.header))
+        self._felt = self._time_of(message.header)
+        self.controller.feel(*odometry_of(message), self._felt)
 
     def _on_goal(self, message: Any) -> None:
         heading = yaw(message.pose.orientation) if self._turns else math.nan
@@ -145,6 +152,9 @@ class PolicyNode(Node):
         self._goal, self._waits = (pose, message.header.frame_id), ""
         self._stamp = self._stamped_at = -math.inf
         self.controller.aim(None)
+        # Who gave the goal knew this odometry; an older one may be of before it began again.
+        self._known_since = seconds(message.header.stamp) if self._trust_stamps else 0.0
+        self._known_since = self._known_since or self._now()
         self._set_out()
         self._tick()
 
@@ -163,6 +173,8 @@ class PolicyNode(Node):
         if self._goal is None:
             return
         try:
+            if self._felt < self._known_since:
+                raise LookupError("there was no odometry as new as the goal yet")
             x, y, heading = self._in_odometry(*self._goal)
             self._place_plan()
             self.controller.aim((x, y), heading=None if math.isnan(heading) else heading)
@@ -179,12 +191,10 @@ class PolicyNode(Node):
         """Transform a pose of another frame into that of the odometry."""
         if frame in ("", self._odometry_frame):
             return place
-        if self._transforms is None:
-            raise LookupError("tf2_ros is not installed")
-        if self._odometry_frame is None:
-            raise LookupError("there was no odometry yet")
         if not self._odometry_frame:
             raise LookupError("the odometry names no frame")
+        if self._transforms is None:
+            raise LookupError("tf2_ros is not installed")
         found = self._transforms.lookup_transform(self._odometry_frame, frame, Time())
         stamp = seconds(found.header.stamp)
         if stamp != self._stamp:
@@ -227,7 +237,11 @@ class PolicyNode(Node):
             self._goal = None
         else:
             self._correct()
-        order = self.controller.tick(self._now())
+        began = self._now()
+        order = self.controller.tick(began)
+        if self._now() - began > self.controller.scan_timeout:
+            # What it decided by is too old by now.
+            order = self.controller.tick(self._now())
         if order is None:
             return
         reason = order.reason.partition(":")[0]
