@@ -255,10 +255,10 @@ def test_it_turns_to_the_heading_of_the_goal(
 
 
 def occupancy(frame: str, wall: int) -> Any:
-    """A map of 8 x 6 m with a wall across, 4 m before its left edge, of cells with a chance."""
+    """A map of 8 x 6 m with a wall of cells with a chance, 4 m from its left edge, and a door."""
     cells = np.full((60, 80), -1)
     cells[:, 40] = wall
-    cells[30, 40] = 0
+    cells[50:, 40] = 0
     place = names(position=names(x=-2.0, y=-3.0), orientation=names(x=0.0, y=0.0, z=0.0, w=1.0))
     info = names(width=80, height=60, resolution=0.1, origin=place)
     return names(header=names(frame_id=frame), info=info, data=cells.ravel().tolist())

@@ -8,14 +8,22 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_not_negative, check_number, check_positive
-from mpfa_envs.deploy.adaptation import body_of, filter_of, pace_of, tolerance
+from mpfa_envs.deploy.adaptation import (
+    body_of,
+    cannot_turn,
+    filter_of,
+    nearest_admissible,
+    pace_of,
+    ramped,
+    reject_blind_front,
+    tolerance,
+)
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
 from mpfa_envs.robots.drives import Orders
-from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.sensing.scan import Scan, ScanError
+from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
@@ -28,8 +36,6 @@ if TYPE_CHECKING:
 
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
-_BESIDE: Final = 0.01
-"""Cosine above which a direction is ahead."""
 
 
 class Command(NamedTuple):
@@ -114,7 +120,6 @@ class Pilot:
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
-        self.goal_radius = self._arrival.radius
         self._map: MapPath | None = None
         if card.memory == "map":
             # Its loops are compiled before the first decision is due.
@@ -152,6 +157,23 @@ class Pilot:
     def period(self) -> float:
         """Time from decision to decision [s]."""
         return self.card.period / self.pace
+
+    @property
+    def goal_radius(self) -> float:
+        """Distance from the goal at which it has arrived [m]."""
+        return self._arrival.radius
+
+    def adjust(self, *, clearance: float | None = None, goal_radius: float | None = None) -> None:
+        """Change clearance or goal radius, also while driving; None leaves it as it is [m]."""
+        if clearance is not None:
+            self._keep = filter_of(self.card, self.robot, self._body, clearance)
+        if goal_radius is not None:
+            self._arrival.set_radius(goal_radius)
+
+    @property
+    def recoveries(self) -> int:
+        """How often the robot has driven back since it set out."""
+        return self._way_back.count
 
     @property
     def has_filter(self) -> bool:
@@ -200,21 +222,12 @@ class Pilot:
                 is a plan without a map or with a center, or a heading for a robot that cannot turn
                 on the spot.
         """
-        if heading is not None and not self.turns_on_the_spot:
-            raise ValueError(
-                f"heading must be None for {self.robot.name}, which cannot turn on the spot "
-                f"(min_wheel_speed = {self.robot.min_wheel_speed}), got {heading}"
-            )
+        self._arrival.check(heading)
         center = None if map_center is None else pair_of("map_center", map_center)
         goal = pair_of("goal", goal)
-        ground = None
-        if plan is not None:
-            if self._map is None or center is not None:
-                raise ValueError(
-                    "plan must be None for a policy without a map (memory='map'), and with a "
-                    f"map_center, got {plan.name!r}"
-                )
-            ground = plan_at(plan, plan_pose)
+        ground = None if plan is None else plan_at(plan, plan_pose)
+        if ground is not None:
+            ground.check(has_map=self._map is not None, center=center)
             center = ground.middle
         check_on_map(goal, center, ground, self._map_size)
         self._arrival.begin(heading)
@@ -268,6 +281,15 @@ class Pilot:
         if self._goal is None:
             return False
         return self._arrival.is_at(pose, math.dist(pose[:2], self._goal))
+
+    def closed_in(self, place: tuple[float, float]) -> bool:
+        """Return True if all paths from a place (x, y) to the goal cross walls that are known.
+
+        Unseen places count as free. Without a map nothing is known.
+        """
+        if self._map is None or self._goal is None or self._fresh or self._fresh_map:
+            return False
+        return self._map.closes_in(self._goal, self.goal_radius, place)
 
     def observe(
         self,
@@ -331,6 +353,8 @@ class Pilot:
             if self._fresh or self._fresh_map:
                 self._map.begin(center, sides_of(self._plan, self._map_size), self._plan)
                 self._center, self._fresh_map = center, False
+                if self._fresh and self._plan is not None:
+                    self._map.reject_closed(self._goal, self.goal_radius, (x, y))
             path = self._map.sense(ahead[0], taken, self._goal, points)
         facts = self._goal, self._fresh, path, self.pace
         rows = observations_from(ahead, ranges, points, taken, card, self._observation, *facts)
@@ -386,35 +410,22 @@ class Pilot:
         if backwards or (np.abs(towards) < _TOWARDS).any():
             most = min(learned.max_wheel_speed, -learned.min_wheel_speed)
             if most <= 0.0:
-                raise self._cannot_turn()
+                raise cannot_turn(self.robot)
             right = min(max(0.5 * (right - left), -most), most)
             left = -right
         if self._keep is not None:
-            if (np.cos(blind) > _BESIDE).any():
-                raise ScanError(
-                    "the scan must look at all directions up to 90 degrees from ahead for the "
-                    "filter (clearance), which does not drive beside what is not seen"
-                )
+            reject_blind_front(blind)
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             states[:, : self.card.sectors][:, hidden] = 1.0
-            slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
-            action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
-            left, right = learned.wheel_speeds(self._keep.among(states, action))
+            left, right = nearest_admissible(self._keep, learned, states, (left, right))
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
-
-    def _cannot_turn(self) -> ScanError:
-        """The error of a robot that would drive where it does not see, and cannot look there."""
-        return ScanError(
-            "the scan must reach 45 degrees to both sides of where the robot drives, as with "
-            f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
-        )
 
     def _command(self, linear: float, angular: float) -> Command:
         """The command for speeds of the body [m/s, rad/s]."""
         turn = 0.5 * angular * self.robot.wheel_base
         if linear - abs(turn) < self.robot.min_wheel_speed - tolerance(self.robot):
-            raise self._cannot_turn()
+            raise cannot_turn(self.robot)
         self.give(self._time, linear, angular)
         return Command(linear - turn, linear + turn, linear, angular)
 
@@ -436,9 +447,4 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        limits, half = self._body.wheel_limits, 0.5 * self.card.robot.wheel_base
-        if math.isinf(min(limits.acceleration, limits.turning)):
-            return wanted
-        now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
-        left, right = changed(now, to, limits, 1.0, passed * self.pace**2)
-        return 0.5 * (left + right), 0.5 * (right - left) / half
+        return ramped(self._body, self.card.robot.wheel_base, last, wanted, passed * self.pace**2)

@@ -13,11 +13,14 @@ so that others may drive.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from mpfa_envs.checks import check_not_negative, check_positive
+from mpfa_envs.deploy.map_path import GoalError
+from mpfa_envs.ros.disturbances import Disturbances
 from mpfa_envs.ros.laser_input import LaserInput
 from mpfa_envs.ros.odometry_input import Odometry, OdometryInput
+from mpfa_envs.sensing.scan import ScanError
 
 if TYPE_CHECKING:
     from mpfa_envs.deploy.pilot import Command, Pilot
@@ -31,6 +34,18 @@ _PLACE: Final = 0.5
 """Side of the squares that count as one place [m]."""
 _NOWHERE: Final = 40.0
 """A robot that could have driven this far must have come to a new place [m]."""
+_LOOK: Final = 1.0
+"""Time from one look for a path to the next [s]."""
+_CLOSED: Final = 10.0
+"""Time for which walls must close the goal in before it is given up: people step aside [s]."""
+
+State = Literal[
+    "idle", "accepted", "driving", "waiting", "arrived", "canceled", "given up", "rejected"
+]
+"""What has become of the goal: it is under way in the states ``accepted``, not yet decided on,
+``driving`` and ``waiting``, where the robot stands for a reason that may pass; the others are its
+ends, and ``idle`` is before the first one."""
+ACTIVE: Final[tuple[State, ...]] = ("accepted", "driving", "waiting")
 
 
 class Order(NamedTuple):
@@ -68,6 +83,9 @@ class Controller:
         self._places: set[tuple[int, int]] = set()
         self._lost = 0.0
         self._held = ""
+        self.state: State = "idle"
+        self._disturbances = Disturbances()
+        self._looked, self._open = -math.inf, -math.inf
         self._command: Command | None = None
         self._decided = -math.inf
         self._idle = "no goal"
@@ -82,9 +100,24 @@ class Controller:
         self, pose: tuple[float, float, float], speeds: tuple[float, float], time: float
     ) -> None:
         """Take odometry: pose (x, y, heading), forward and turning speed, time [m, rad, s]."""
-        lost = self._odometry.take(Odometry(pose, speeds, time), self._ordered[0])
+        odometry = Odometry(pose, speeds, time)
+        lost = self._odometry.take(odometry, self._ordered[0])
+        if self._odometry.last is odometry:
+            self._disturbances.take(odometry, self._ordered)
         if lost and self.pilot.goal is not None:
-            self.aim(None, lost)
+            self._give_up(lost)
+
+    def note(self, now: float) -> str:
+        """What is worth saying at a time [s], though the robot drives on; empty if nothing is."""
+        if self.state not in ACTIVE:
+            return ""
+        reading = self._laser.last
+        closed = "unreachable so far: walls that were seen close the goal in"
+        return (
+            (closed if self._looked > self._open else "")
+            or ("" if reading is None else reading.inside)
+            or self._disturbances.note(now)
+        )
 
     def know(self, plan: World | None, pose: tuple[float, float, float]) -> None:
         """Take the plan for this and later goals, and its pose in the frame of the odometry."""
@@ -98,13 +131,18 @@ class Controller:
         reason: str = "no goal",
         *,
         heading: float | None = None,
+        state: State = "canceled",
     ) -> None:
         """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason.
 
-        There the robot turns to a heading, if there is one [rad].
+        There the robot turns to a heading, if there is one [rad]. Without a goal, the state is what
+        has become of the last one.
         """
         self._command, self._told = None, False
         self._idle, self._held = reason, ""
+        self.state = state if goal is None else "accepted"
+        self._looked = self._open = -math.inf
+        self._disturbances.forget()
         self._places, self._lost = set(), 0.0
         # The goal is in the frame of the odometry from now on.
         self._odometry.forget()
@@ -115,7 +153,11 @@ class Controller:
                 plan, pose = self._plan or (None, (0.0, 0.0, 0.0))
                 self.pilot.begin(goal, plan=plan, plan_pose=pose, heading=heading)
             except ValueError as error:
-                self._idle = str(error)
+                self._idle, self.state = str(error), "rejected"
+
+    def _give_up(self, reason: str) -> None:
+        """Stop for a reason that does not pass."""
+        self.aim(None, reason, state="given up")
 
     def correct_goal(self, goal: tuple[float, float], heading: float | None = None) -> None:
         """The goal in the frame of the odometry, which has drifted; NaN gives up the goal."""
@@ -123,7 +165,7 @@ class Controller:
             try:
                 self.pilot.move_goal(goal, heading=heading)
             except ValueError as error:
-                self.aim(None, str(error))
+                self._give_up(str(error))
 
     def hold(self, reason: str) -> None:
         """Stand still for a reason from outside, until it is empty or the goal is new."""
@@ -152,23 +194,43 @@ class Controller:
             or self._odometry.missing(now, self.odometry_timeout)
         )
         if reason or reading is None or odometry is None:
-            self._command = None
-            return Order(0.0, 0.0, reason)
+            return self._wait(reason)
         if self.pilot.arrived(odometry.pose):
-            self.aim(None, "arrived")
-            return self._choose(now)
-        if self._lost > _NOWHERE:
-            reason = "stands still" if self.pilot.stands_still else "no progress"
-            self.aim(None, f"{reason}: time for {_NOWHERE:g} m, and no new place")
-            return self._choose(now)
-        try:
-            order = self._drive(reading, odometry, now)
-        # Whatever the policy raises: a policy that has failed is not asked again.
-        except Exception as error:
-            self.aim(None, str(error) if isinstance(error, ValueError) else f"failed: {error!r}")
-            return self._choose(now)
-        self._count(odometry)
-        return self._unless_blocked(order, reading, now)
+            self.aim(None, "arrived", state="arrived")
+        elif stuck := self._stuck(reading):
+            self._give_up(stuck)
+        else:
+            try:
+                order = self._drive(reading, odometry, now)
+            except ScanError as error:
+                # The next scan may look there, as where a turning robot has lost one.
+                self._count(odometry)
+                return self._wait(str(error))
+            except GoalError as error:
+                self.aim(None, str(error), state="rejected")
+            # Whatever the policy raises: a policy that has failed is not asked again.
+            except Exception as error:
+                known = isinstance(error, ValueError)
+                self._give_up(str(error) if known else f"failed: {error!r}")
+            else:
+                self._count(odometry)
+                return self._unless_blocked(order, reading, now)
+        return self._choose(now)
+
+    def _wait(self, reason: str) -> Order:
+        """Stand still for a reason that may pass."""
+        self._command, self.state = None, "waiting"
+        return Order(0.0, 0.0, reason)
+
+    def _stuck(self, reading: LaserReading) -> str:
+        """Why the goal is given up; empty if the robot may still reach it."""
+        if self._looked - self._open > _CLOSED:
+            return f"unreachable: for {_CLOSED:g} s walls that were seen have closed the goal in"
+        if self._lost <= _NOWHERE:
+            return ""
+        reason = "stands still" if self.pilot.stands_still else "no progress"
+        cause = f"; {reading.inside}" if reading.inside else ""
+        return f"{reason}: time for {_NOWHERE:g} m, and no new place{cause}"
 
     def _unless_blocked(self, order: Order, reading: LaserReading, now: float) -> Order:
         """The order, or its turn alone if it comes too near to something before the next check."""
@@ -181,6 +243,7 @@ class Controller:
         covered = fastest * (max(now - reading.time, 0.0) + self.check_period)
         if clearance - covered > self.stop_distance:
             return order
+        self.state = "waiting"
         reason = f"obstacle: {max(clearance, 0.0):.2f} m from the rim"
         return Order(0.0, order.angular, reason)
 
@@ -194,7 +257,16 @@ class Controller:
                 reading.scan, odometry.pose, odometry.speeds, scan_pose=taken, time=now, age=age
             )
             self._decided = now
+            self._look_for_path(odometry, now)
+        self.state = "driving"
         return Order(*self.pilot.ramp(self._ordered, self._command[2:], self._passed), "driving")
+
+    def _look_for_path(self, odometry: Odometry, now: float) -> None:
+        """Find out whether walls close the goal in, once in a while."""
+        if not self._looked <= now < self._looked + _LOOK:
+            first, self._looked = self._open == -math.inf, now
+            if not self.pilot.closed_in(odometry.pose[:2]) or first:
+                self._open = now
 
     def _count(self, odometry: Odometry) -> None:
         """Count how far the robot could have driven since it came to its last new place."""

@@ -36,6 +36,8 @@ class LaserReading(NamedTuple):
     """Why it cannot be used; empty if it can."""
     repeated: bool = False
     """True if the robot has moved, and this scan has not changed."""
+    inside: str = ""
+    """What is to be said of a ray that ends inside the robot; empty without."""
 
 
 class LaserInput:
@@ -61,8 +63,20 @@ class LaserInput:
             self.last = LaserReading(scan, moment, fault=str(error))
             return
         repeated = self._repeats(scan, moment, points, odometry)
-        self.last = LaserReading(
-            scan, self._since if repeated else moment, *self._obstacles(scan, points), repeated
+        since = self._since if repeated else moment
+        ahead, behind, fault = self._obstacles(scan, points)
+        inside = self._inside(scan)
+        self.last = LaserReading(scan, since, ahead, behind, fault, repeated, inside)
+
+    def _inside(self, scan: Scan) -> str:
+        """What is to be said of a ray that ends inside the robot."""
+        ray = self._sectors.inside(scan)
+        if ray is None:
+            return ""
+        degrees, depth = math.degrees(ray[0]), ray[1]
+        return (
+            f"the ray at {degrees:.0f} degrees of the scan ends {depth:.2f} m inside the robot: "
+            "filter the robot's own parts out of the scan, or clean the lidar"
         )
 
     def _obstacles(self, scan: Scan, points: Points) -> tuple[float, float, str]:
