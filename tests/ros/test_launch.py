@@ -23,6 +23,7 @@ DOCS = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf
 
 def parameters(module: str) -> dict[str, object]:
     """The table of a node's parameters, which is read without rclpy."""
+    module = {"policy_node.py": "parameters.py"}.get(module, module)
     for each in ast.parse((FOLDER / module).read_text(encoding="utf-8")).body:
         if isinstance(each, ast.AnnAssign) and ast.unparse(each.target) == "PARAMETERS":
             assert each.value is not None

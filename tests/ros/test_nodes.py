@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -15,10 +14,11 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed: the nodes were not run")
+pytest.importorskip("rclpy", reason="rclpy is not installed: the nodes were not run (extra ros)")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.qos import qos_profile_sensor_data
@@ -28,6 +28,7 @@ from std_msgs.msg import Bool
 from mpfa_envs import Task, evaluate, export_policy, load_policy, world_tasks
 from mpfa_envs.ros.messages import odometry_of, seconds, write_pose
 from tests.envs.exported import SHIPPED
+from tests.ros.live import choose_domain
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 _SPEED = 3.0
@@ -60,6 +61,8 @@ class Bench:
         hear(Odometry, "odom", self._on_odometry, 10)
         hear(Bool, "contact", self._on_contact, 10)
         hear(Twist, "cmd_vel", self._on_command, 10)
+        self.status: dict[str, str] = {}
+        hear(DiagnosticStatus, "mpfa_policy/status", self._on_status, 10)
 
     def _on_odometry(self, message: Any) -> None:
         self.pose, self.speeds = odometry_of(message)
@@ -70,6 +73,9 @@ class Bench:
 
     def _on_command(self, message: Any) -> None:
         self.commands.append((message.linear.x, message.angular.z))
+
+    def _on_status(self, message: Any) -> None:
+        self.status = {each.key: each.value for each in message.values}
 
     def until(self, holds: Callable[[], bool], timeout: float) -> bool:
         """Wait until something holds, or for so many seconds."""
@@ -82,14 +88,13 @@ class Bench:
         """Have the robot drive a task; whether it reached the goal and nothing else."""
         self.send(self.start, task.start)
         assert self.until(lambda: math.dist(self.pose[:2], task.start[:2]) < 0.01, 20.0)
-        self.touched, end = False, self.now + 50.0
+        self.touched, number = False, int(self.status.get("goal", "0")) + 1
         self.send(self.goal, (*task.goal, 0.0), self.now)
-
-        def near() -> bool:
-            return math.dist(self.pose[:2], task.goal) <= 0.5
-
-        self.until(lambda: near() or self.touched or self.now > end, 120.0)
-        return near() and not self.touched
+        assert self.until(lambda: self.status.get("goal") == str(number), 20.0)
+        end = self.now + 50.0
+        ends = ("arrived", "given up", "rejected")
+        self.until(lambda: self.status["state"] in ends or self.touched or self.now > end, 120.0)
+        return self.status["state"] == "arrived" and not self.touched
 
     def send(self, publisher: Any, pose: tuple[float, float, float], now: float = 0.0) -> None:
         message = PoseStamped()
@@ -101,7 +106,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    choose_domain()
     rclpy.init()
     found = Bench()
     yield found

@@ -92,6 +92,11 @@ class Controller:
         self._told = True
         self._plan: tuple[World, tuple[float, float, float]] | None = None
 
+    def set_scan_timeout(self, timeout: float) -> None:
+        """Change the oldest scan that it drives by [s]."""
+        self.scan_timeout = check_positive("scan_timeout", timeout)
+        self._odometry.set_memory(timeout)
+
     def see(self, scan: Scan, time: float) -> None:
         """Take a scan and its time [s]."""
         self._laser.take(scan, time, self._odometry)

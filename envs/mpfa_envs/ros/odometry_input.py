@@ -38,13 +38,17 @@ class OdometryInput:
     def __init__(self, robot: RobotModel, memory: float) -> None:
         # Twice what the wheels can, turning on the spot.
         self._limits = 2.0 * robot.max_wheel_speed, 4.0 * robot.max_wheel_speed / robot.wheel_base
-        self._memory = max(_MEMORY, memory)
+        self.set_memory(memory)
         self._past: deque[Odometry] = deque()
         self._pushed = 0.0
         self._from: Pose | None = None
         self._finite = True
         self.last: Odometry | None = None
         """Of numbers that are finite."""
+
+    def set_memory(self, memory: float) -> None:
+        """Keep the odometry of a time [s], or longer."""
+        self._memory = max(_MEMORY, memory)
 
     def take(self, odometry: Odometry, ordered: float) -> str:
         """Take odometry and the last order [m/s]; return why its poses cannot be trusted."""
