@@ -34,9 +34,12 @@ class Surroundings:
     def __init__(self) -> None:
         self.node = rclpy.create_node("surroundings")
         self.pose, self.speeds = [0.0, 0.0, 0.0], (0.0, 0.0)
-        self.sees = self.feels = True
-        self.moves = True
+        self.sees = True
         self.sent: list[tuple[float, float]] = []
+        self.times: list[float] = []
+        """When the orders came [s]."""
+        self.spoils: Callable[[Any, Any], None] = lambda scan, odometry: None
+        """Changes messages before they are published."""
         self.statuses: list[dict[str, str]] = []
         self.feedbacks: list[list[float]] = []
         publish, hear = self.node.create_publisher, self.node.create_subscription
@@ -47,7 +50,8 @@ class Surroundings:
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         hear(DiagnosticStatus, "mpfa_policy/status", self._on_status, latched)
         hear(Float64MultiArray, "mpfa_policy/feedback", self._on_feedback, 10)
-        self.node.create_timer(0.05, self.publish)
+        self._period, self._timer = 0.0, None
+        self.scan_every(0.05)
 
     @property
     def states(self) -> list[str]:
@@ -55,38 +59,44 @@ class Surroundings:
         states = [status["state"] for status in self.statuses]
         return [state for i, state in enumerate(states) if not i or state != states[i - 1]]
 
+    def scan_every(self, period: float) -> None:
+        """Change the period of scans and odometry [s]."""
+        if self._timer is not None:
+            self.node.destroy_timer(self._timer)
+        self._period, self._timer = period, self.node.create_timer(period, self.publish)
+
     def publish(self) -> None:
         """Move as ordered, and publish what is measured."""
-        if self.moves:
-            linear, angular = self.speeds
-            self.pose[0] += 0.05 * linear * math.cos(self.pose[2])
-            self.pose[1] += 0.05 * linear * math.sin(self.pose[2])
-            self.pose[2] = math.remainder(self.pose[2] + 0.05 * angular, math.tau)
-        stamp = self.node.get_clock().now().to_msg()
+        linear, angular = self.speeds
+        self.pose[0] += self._period * linear * math.cos(self.pose[2])
+        self.pose[1] += self._period * linear * math.sin(self.pose[2])
+        self.pose[2] = math.remainder(self.pose[2] + self._period * angular, math.tau)
+        now = self.node.get_clock().now()
         felt = Odometry()
-        felt.header.stamp, felt.header.frame_id = stamp, "odom"
+        felt.header.stamp, felt.header.frame_id = now.to_msg(), "odom"
         write_pose(felt.pose.pose, (self.pose[0], self.pose[1], self.pose[2]))
         felt.twist.twist.linear.x, felt.twist.twist.angular.z = self.speeds
-        if self.feels:
-            self._odometry.publish(felt)
+        seen = LaserScan(angle_min=-math.pi, angle_increment=math.pi / 180, range_max=8.0)
+        seen.angle_max = math.pi - math.pi / 180
+        # No two scans of a robot that moves are alike.
+        free = 6.0 + 0.1 * math.sin(10.0 * self.pose[0])
+        seen.header.stamp, seen.ranges = now.to_msg(), [free] * 360
+        self.spoils(seen, felt)
+        self._odometry.publish(felt)
         if self.sees:
-            seen = LaserScan(angle_min=-math.pi, angle_increment=math.pi / 180, range_max=8.0)
-            seen.angle_max = math.pi - math.pi / 180
-            # No two scans of a robot that moves are alike.
-            free = 6.0 + 0.1 * math.sin(10.0 * self.pose[0])
-            seen.header.stamp, seen.ranges = stamp, [free] * 360
             self._scans.publish(seen)
 
-    def aim(self, x: float, y: float = 0.0) -> None:
+    def aim(self, x: float, y: float = 0.0, frame: str = "odom") -> None:
         """Send a goal."""
         message = PoseStamped()
-        message.header.frame_id = "odom"
+        message.header.frame_id = frame
         write_pose(message.pose, (x, y, 0.0))
         self.goals.publish(message)
 
     def _on_command(self, message: Any) -> None:
         self.speeds = message.linear.x, message.angular.z
         self.sent.append(self.speeds)
+        self.times.append(time.monotonic())
 
     def _on_status(self, message: Any) -> None:
         self.statuses.append({each.key: each.value for each in message.values})
@@ -98,11 +108,11 @@ class Surroundings:
 class Live:
     """The policy's node, its surroundings, and the executor of both."""
 
-    def __init__(self, make: Callable[[], Any]) -> None:
+    def __init__(self, make: Callable[[], Any] | None) -> None:
         self.around = Surroundings()
-        self.node = make()
+        self.node = None if make is None else make()
         self.executor = SingleThreadedExecutor()
-        for node in (self.around.node, self.node):
+        for node in filter(None, (self.around.node, self.node)):
             self.executor.add_node(node)
 
     def until(self, holds: Callable[[], Any], timeout: float = 20.0) -> bool:
@@ -123,8 +133,8 @@ class Live:
 
 
 @contextmanager
-def live(make: Callable[..., Any], **parameters: Any) -> Iterator[Live]:
-    """A node with parameters, and what stands around it."""
+def live(make: Callable[..., Any] | None, **parameters: Any) -> Iterator[Live]:
+    """A node with parameters, or None, and what stands around it."""
     choose_domain()
     words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
     rclpy.init(args=["--ros-args", *words] if words else None)
@@ -133,7 +143,8 @@ def live(make: Callable[..., Any], **parameters: Any) -> Iterator[Live]:
         yield made
     finally:
         made.executor.shutdown()
-        made.node.destroy_node()
+        if made.node is not None:
+            made.node.destroy_node()
         made.around.node.destroy_node()
         rclpy.shutdown()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,7 +19,8 @@ from mpfa_envs.ros.controller import Controller
 from tests.envs.exported import card
 
 FOLDER = Path(mpfa_envs.__file__).parent / "ros"
-DOCS = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+DOCS = (ROOT / "docs" / "robot.md").read_text(encoding="utf-8")
 
 
 def parameters(module: str) -> dict[str, object]:
@@ -32,18 +34,59 @@ def parameters(module: str) -> dict[str, object]:
     raise AssertionError(module)
 
 
-def test_the_launch_file_passes_arguments_that_the_node_declares() -> None:
-    root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
-    declared = {each.get("name") for each in root.iter("arg")}
-    command = next(root.iter("executable")).get("cmd") or ""
-    assert set(re.findall(r"\$\(var (\w+)\)", command)) == declared
-    assert (
-        (FOLDER / re.findall(r"-m mpfa_envs\.ros\.(\w+)", command)[0]).with_suffix(".py").exists()
-    )
-    assert set(re.findall(r"-p (\w+):=", command)) <= {
-        *parameters("policy_node.py"),
-        "use_sim_time",
+LAUNCHES = sorted((FOLDER / "launch").glob("*.launch.xml"))
+
+
+@pytest.mark.parametrize("file", LAUNCHES, ids=lambda file: file.name)
+def test_a_launch_file_passes_arguments_that_the_nodes_declare(file: Path) -> None:
+    root = ElementTree.parse(file).getroot()
+    declared = {each.get("name") for each in root.findall("arg")}
+    text = file.read_text(encoding="utf-8")
+    assert set(re.findall(r"\$\(var (\w+)\)", text)) == declared
+    for each in root.iter("executable"):
+        command = each.get("cmd") or ""
+        module = re.findall(r"-m mpfa_envs\.ros\.(\w+)", command)[0]
+        assert set(re.findall(r"-p (\w+):=", command)) <= {
+            *parameters(f"{module}.py"),
+            "use_sim_time",
+        }
+    for each in root.iter("include"):
+        name = (each.get("file") or "").removeprefix("$(dirname)/")
+        other = ElementTree.parse(FOLDER / "launch" / name).getroot()
+        takes = {arg.get("name") for arg in other.findall("arg")}
+        assert {arg.get("name") for arg in each.iter("arg")} == takes
+
+
+@pytest.mark.parametrize("file", sorted((FOLDER / "launch").glob("*.yaml")), ids=lambda f: f.stem)
+def test_each_robot_has_a_launch_file(file: Path) -> None:
+    text = file.with_suffix(".launch.xml").read_text(encoding="utf-8")
+    assert f"$(dirname)/{file.name}" in text
+
+
+def test_a_prefix_has_what_ros2_run_and_ros2_launch_look_for() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    section = text.partition("[tool.hatch.build.targets.wheel.shared-data]")[2].partition("\n\n")[0]
+    places = {there: ROOT / here for here, there in re.findall(r'"(.+)" = "(.+)"', section)}
+    assert set(places) == {
+        "share/ament_index/resource_index/packages/mpfa_envs",
+        "share/mpfa_envs/package.xml",
+        "share/mpfa_envs/launch",
+        "lib/mpfa_envs/policy_node",
+        "lib/mpfa_envs/robot_node",
     }
+    package = ElementTree.parse(places["share/mpfa_envs/package.xml"]).getroot()
+    assert package.findtext("name") == "mpfa_envs"
+    assert package.findtext("version") == mpfa_envs_version()
+    for name in ("policy_node", "robot_node"):
+        script = places[f"lib/mpfa_envs/{name}"]
+        assert os.access(script, os.X_OK) and f"-m mpfa_envs.ros.{name} " in script.read_text()
+        assert (FOLDER / f"{name}.py").exists()
+
+
+def mpfa_envs_version() -> str:
+    """The version of the wheel."""
+    text = (ROOT / "torchrl_mpfa" / "__init__.py").read_text(encoding="utf-8")
+    return re.findall(r'__version__ = "(.+)"', text)[0]
 
 
 @pytest.mark.parametrize("file", sorted((FOLDER / "launch").glob("*.yaml")), ids=lambda f: f.stem)

@@ -47,7 +47,7 @@ def odometry(time: float, x: float = 0.0, frame: str = "odom", speed: float = 0.
 
 
 def scan(time: float) -> Any:
-    header = names(stamp=stamp(time))
+    header = names(stamp=stamp(time), frame_id="laser")
     field = {"angle_min": -math.pi, "angle_increment": math.pi / 180}
     return names(header=header, **field, ranges=np.full(360, 5.0), range_min=0.1, range_max=8.0)
 
@@ -61,7 +61,7 @@ def transform(time: float, x: float = 0.0) -> Any:
 class Rig:
     """A navigator, a transform that tf2 would find, and what was ordered and said."""
 
-    def __init__(self, policy: str, **parameters: Any) -> None:
+    def __init__(self, policy: str, *, base: str = "", **parameters: Any) -> None:
         self.transform: Any = None
         values = PARAMETERS | {"policy": policy} | parameters
         frames = Frames(self.look_up, trust_stamps=values["trust_stamps"])
@@ -70,6 +70,7 @@ class Rig:
             frames,
             trust_stamps=values["trust_stamps"],
             turns=values["goal_heading"],
+            base=base,
         )
         self.sent: list[tuple[float, float]] = []
         self.reason = ""
@@ -299,3 +300,28 @@ def test_changes_that_it_takes_hold_from_then_on(tmp_path: Path) -> None:
     change(changes, controller)
     assert controller.pilot.goal_radius == 0.2 and controller.scan_timeout == 2.0
     assert controller.pilot.has_filter and controller.pilot._keep is not before
+
+
+@pytest.mark.parametrize(
+    ("turn", "roll"), [((0.0, 0.0, 1.0, 0.0), 0.0), ((1.0, 0.0, 0.0, 0.0), math.pi)]
+)
+def test_the_lidar_is_where_its_frame_is(
+    tmp_path: Path, turn: tuple[float, ...], roll: float
+) -> None:
+    rig = Rig(straight(tmp_path), base="base_link", mount=[0.01, 0.0, 0.0])
+    sectors = rig.navigator.controller.pilot.sectors
+    rig.navigator.see(scan(10.0), 10.0)
+    assert sectors.mount == (0.01, 0.0, 0.0)  # The parameter's, as tf2 does not know it yet.
+    found = transform(0.0, x=-0.04)
+    found.transform.rotation = names(**dict(zip("xyzw", turn, strict=True)))
+    rig.transform = found
+    rig.navigator.see(scan(10.1), 10.1)
+    assert sectors.mount == pytest.approx((-0.04, 0.0, math.pi if not roll else 0.0))
+    assert (sectors._side < 0.0) == (roll > 0.0)
+
+
+def test_a_lidar_outside_of_the_robot_is_an_error(tmp_path: Path) -> None:
+    rig = Rig(straight(tmp_path), base="base_link")
+    rig.transform = transform(0.0, x=3.0)
+    with pytest.raises(ValueError, match="mount must be"):
+        rig.navigator.see(scan(10.0), 10.0)

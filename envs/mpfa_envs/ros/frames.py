@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from mpfa_envs.ros.messages import Pose, seconds, transformed
+from mpfa_envs.ros.messages import Pose, mount_of, seconds, transformed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,6 +48,15 @@ class Frames:
         if stamp != self._stamp:
             self._stamp, self._came = stamp, now
         return transformed(place, found.transform)
+
+    def mount(self, sensor: str, base: str) -> tuple[float, ...] | None:
+        """Pose of a sensor's frame in that of the robot; None where tf2 does not know it."""
+        if self._lookup is None or not sensor:
+            return None
+        # What tf2 raises has no public base class.
+        with suppress(Exception):
+            return mount_of(self._lookup(base, sensor).transform)
+        return None
 
     def age(self, now: float) -> float:
         """Age of the last transform [s]; transforms that never change have none."""

@@ -37,12 +37,14 @@ class Navigator:
         trust_stamps: bool = True,  # False: what a message says is of the time when it came
         turns: bool = True,  # to the heading of a goal, where the robot can
         transform_timeout: float = 1.0,  # oldest transform by which it drives [s]
+        base: str = "",  # frame of the robot, in which tf2 knows the lidar; empty: it is not asked
     ) -> None:
         self.controller, self.frames = controller, frames
         self._trust_stamps, self._transform_timeout = trust_stamps, transform_timeout
         self._turns = turns and controller.pilot.turns_on_the_spot
         self._goal: tuple[Pose, str] | None = None
         self._plan: tuple[World, Pose, str] | None = None
+        self._base, self._sensor = base, ""
         self._waits = ""
         self._felt, self._known_since, self._since = -math.inf, -math.inf, 0.0
         self.pose: Pose | None = None
@@ -65,6 +67,7 @@ class Navigator:
 
     def see(self, message: Any, now: float) -> None:
         """Take a ``sensor_msgs/LaserScan``."""
+        self._find_lidar(message.header.frame_id)
         self.controller.see(scan_of(message), self._time_of(message.header, now))
 
     def feel(self, message: Any, now: float) -> None:
@@ -121,6 +124,14 @@ class Navigator:
         if pilot.goal is not None and self.pose is not None:
             distance = math.dist(self.pose[:2], pilot.goal)
         return Progress(distance, max(now - self._since, 0.0), pilot.recoveries)
+
+    def _find_lidar(self, sensor: str) -> None:
+        """Mount the lidar where tf2 has it, once; a place outside of the robot is an error."""
+        if self._base and sensor != self._sensor:
+            mount = self.frames.mount(sensor, self._base)
+            if mount is not None:
+                self.controller.pilot.sectors.mount_at(mount)
+                self._sensor = sensor
 
     def _time_of(self, header: Any, now: float) -> float:
         return seconds(header.stamp) if self._trust_stamps else now

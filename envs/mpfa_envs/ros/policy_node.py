@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
@@ -35,10 +36,14 @@ from mpfa_envs.ros.status import Status, feedback
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mpfa_envs.ros.controller import Order
+    from mpfa_envs.ros.controller import Order, State
 
 _FEEDBACK: Final = 0.5
 """Time from one feedback to the next [s]."""
+_WATCH: Final = 0.1
+"""Time from one look at the clock to the next [s]."""
+_FROZEN: Final = 0.5
+"""Time for which the clock may stand still while the robot drives [s]."""
 _LATCHED: Final = {"depth": 1, "durability": DurabilityPolicy.TRANSIENT_LOCAL}
 
 
@@ -60,6 +65,9 @@ class PolicyNode(LifecycleNode):
         self._undo: list[Callable[[], Any]] = []
         self._goals, self._reason, self._told_at = 0, "", -1.0
         self._kind: tuple[Any, ...] = ()
+        # A clock of a simulator may stop, and with it all that counts its time.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._ticked, self._ticked_at, self._frozen = 0, 0, ""
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
@@ -114,6 +122,7 @@ class PolicyNode(LifecycleNode):
             trust_stamps=value("trust_stamps"),
             turns=value("goal_heading"),
             transform_timeout=timeout,
+            base=value("base_frame"),
         )
         self._stamped, self._base_frame = value("stamped"), value("base_frame")
         kind = TwistStamped if self._stamped else Twist
@@ -126,11 +135,10 @@ class PolicyNode(LifecycleNode):
         if topic := value("map_topic"):
             self._hear(OccupancyGrid, topic, self.navigator.know, QoSProfile(**_LATCHED))
         service = self.create_service(Trigger, "~/cancel", self._on_cancel)
-        timer = self.create_timer(1.0 / value("rate"), self._tick)
-        self._undo += [
-            partial(self.destroy_service, service),
-            partial(self.destroy_timer, timer),
-        ]
+        self._undo.append(partial(self.destroy_service, service))
+        checks = self.create_timer(1.0 / value("rate"), self._tick)
+        watch = self.create_timer(_WATCH, self._watch, clock=self._steady)
+        self._undo += [partial(self.destroy_timer, timer) for timer in (checks, watch)]
         self._serve_action()
 
     def _publish_on(self, kind: Any, topic: str, quality: Any) -> Any:
@@ -191,7 +199,11 @@ class PolicyNode(LifecycleNode):
 
     def _on_scan(self, message: Any) -> None:
         if self.navigator is not None:
-            self.navigator.see(message, self._now())
+            try:
+                self.navigator.see(message, self._now())
+            except ValueError as error:
+                # The last scan grows old, which stops the robot.
+                self.get_logger().error(f"scan: {error}", throttle_duration_sec=5.0)
             self._tick()
 
     def _on_odometry(self, message: Any) -> None:
@@ -229,6 +241,18 @@ class PolicyNode(LifecycleNode):
             self.stop()
         self.is_driving = False
 
+    def _watch(self) -> None:
+        """Stop a driving robot where the clock stands still."""
+        now, steady = self.get_clock().now().nanoseconds, self._steady.now().nanoseconds
+        if now != self._ticked:
+            self._ticked, self._ticked_at, self._frozen = now, steady, ""
+        elif self.navigator is not None and self.navigator.is_active:
+            passed = 1e-9 * (steady - self._ticked_at)
+            if passed > _FROZEN:
+                self._frozen = f"the clock stands still: for {passed:.1f} s"
+                self.stop()
+                self._tell()
+
     def _tick(self) -> None:
         if self.navigator is None or not self.is_driving:
             return
@@ -261,8 +285,10 @@ class PolicyNode(LifecycleNode):
         navigator, now = self.navigator, self._now()
         if navigator is None:
             return
-        reason = navigator.waits or self._reason
-        status = Status(navigator.state, reason, navigator.controller.note(now), self._goals)
+        frozen = self._frozen if navigator.is_active else ""
+        reason = frozen or navigator.waits or self._reason
+        state: State = "waiting" if frozen else navigator.state
+        status = Status(state, reason, navigator.controller.note(now), self._goals)
         if status.kind != self._kind:
             self._kind = status.kind
             message = status.message(self.get_name())

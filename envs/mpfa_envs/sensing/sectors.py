@@ -106,10 +106,8 @@ class Sectors:
         radius: float | None = None,
     ) -> None:
         self.card = card
-        rim = card.robot.radius if radius is None else check_positive("radius", radius)
-        *place, roll = (*check_mount("mount", mount, rim), 0.0)[:4]
-        self.mount = tuple(place)
-        self._side, self._rim = 1.0 if abs(roll) < 1.0 else -1.0, rim
+        self._rim = card.robot.radius if radius is None else check_positive("radius", radius)
+        self.mount_at(mount)
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
         self.silent: Silent = check_choice("silent", silent, Silent)
         self._edge = 0.5 * math.radians(card.field_of_view)
@@ -118,6 +116,12 @@ class Sectors:
         self._middles = self._edge - width * (np.arange(card.sectors) + 0.5)
         self._near: tuple[NDArray[np.float64], NDArray[np.float64]] = np.empty(0), np.empty(0)
         self._met = False
+
+    def mount_at(self, mount: tuple[float, ...]) -> None:
+        """Change the position of the sensor; arguments and errors as for the class."""
+        *place, roll = (*check_mount("mount", mount, self._rim), 0.0)[:4]
+        self.mount = tuple(place)
+        self._side = 1.0 if abs(roll) < 1.0 else -1.0
 
     def read(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
         """Read a scan.
