@@ -184,7 +184,7 @@ def test_orders_come_in_time_while_others_burn_the_cores(
         found.until(lambda: False, 30.0)
         periods = np.diff(around.times[start:])
         median, late = np.percentile(periods, [50.0, 99.0])
-        record_property("median and 99 % of the period of orders [s]", (median, late))
+        record_property("median and 99 % of the period of orders [s]", (float(median), float(late)))
         # The base stops after 0.5 s without an order.
         assert median < 0.1 and late < 0.5
         moving = [order[0] > 0.0 for order in around.sent[start:]]
