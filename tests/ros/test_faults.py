@@ -104,6 +104,22 @@ def test_wrong_messages_stop_it_while_they_last(
     assert driving.until(lambda: around.sent[-1][0] > 0.1)
 
 
+def test_a_decision_that_takes_too_long_is_not_driven(driving: Live) -> None:
+    pilot = driving.node.navigator.controller.pilot
+    decide = pilot._network
+
+    def slowly(seen: Any) -> Any:
+        time.sleep(0.7)
+        return decide(seen)
+
+    pilot._network = slowly
+    around = driving.around
+    assert driving.until(lambda: around.sent[-1] == STANDS)
+    assert driving.until(lambda: around.statuses[-1]["reason"].startswith("too late"))
+    pilot._network = decide
+    assert driving.until(lambda: around.sent[-1][0] > 0.1)
+
+
 def test_another_frame_of_the_odometry_gives_up_the_goal(driving: Live) -> None:
     def renames(_: Any, odometry: Any) -> None:
         odometry.header.frame_id = "odom_combined"

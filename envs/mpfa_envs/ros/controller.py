@@ -176,6 +176,12 @@ class Controller:
         """Stand still for a reason from outside, until it is empty or the goal is new."""
         self._held = reason
 
+    def stand(self, reason: str) -> Order:
+        """The order to stand for a reason from outside that has passed at the next tick."""
+        self._ordered = 0.0, 0.0
+        self.pilot.give(self._ticked, 0.0, 0.0)
+        return self._wait(reason)
+
     def tick(self, now: float) -> Order | None:
         """The order to publish at a time [s], if any; call it several times a second."""
         self._passed = min(max(now - self._ticked, 0.0), self.pilot.period)

@@ -250,7 +250,7 @@ class PolicyNode(LifecycleNode):
             passed = 1e-9 * (steady - self._ticked_at)
             if passed > _FROZEN:
                 self._frozen = f"the clock stands still: for {passed:.1f} s"
-                self.stop()
+                self._order(self.navigator.controller.stand(self._frozen))
                 self._tell()
 
     def _tick(self) -> None:
@@ -267,11 +267,12 @@ class PolicyNode(LifecycleNode):
 
     def _check(self, navigator: Navigator) -> None:
         """Publish what the navigator orders."""
-        began = self._now()
-        order = navigator.check(began)
-        if self._now() - began > navigator.controller.scan_timeout:
-            # What it decided by is too old by now.
-            order = navigator.check(self._now())
+        # Not by the node's clock: one of a simulator does not go on while the node decides.
+        began = self._steady.now().nanoseconds
+        order = navigator.check(self._now())
+        passed = 1e-9 * (self._steady.now().nanoseconds - began)
+        if passed > navigator.controller.scan_timeout and navigator.is_active:
+            order = navigator.controller.stand(f"too late: the decision took {passed:.1f} s")
         if order is not None:
             self._order(order)
         self._tell()
