@@ -10,7 +10,24 @@ from pathlib import Path
 import pytest
 
 import torchrl_mpfa
+from torchrl_mpfa import SignalSampler, SignalTensorStorage
+from torchrl_mpfa.samplers import SignalTable
+from torchrl_mpfa.samplers.trees import CompiledTrees
 
+ROOT = Path(__file__).resolve().parents[1]
+SAID = {
+    "anneal",
+    "stats",
+    "clear",
+    "blank",
+    "replay_counts",
+    "move_to",
+    "take",
+    "restored",
+    "fill_learned",
+}
+"""Of users, and of a part to itself and its states."""
+SAID |= {"state_dict"}
 NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]
 
 
@@ -137,3 +154,14 @@ def look(package, names):
 def test_an_unknown_name_is_an_attribute_error(package):
     code = f"import {package}\nassert not hasattr({package}, 'no_such_module')"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("kind", [SignalSampler, SignalTensorStorage, SignalTable, CompiledTrees])
+def test_what_one_part_says_to_another_is_on_the_page_of_the_design(kind):
+    page = (ROOT / "docs/design.md").read_text(encoding="utf-8")
+    table = page.split("## What the parts of a buffer say")[1].split("\n## ")[0]
+    own = [part for part in kind.__mro__ if part.__module__.startswith("torchrl_mpfa")]
+    theirs = {name for part in kind.__mro__ if part not in own for name in vars(part)}
+    called = {n for part in own for n, v in vars(part).items() if inspect.isfunction(v)}
+    unsaid = {name for name in called - theirs - SAID if not name.startswith("_")}
+    assert not {name for name in unsaid if f"`{name}`" not in table}

@@ -21,8 +21,6 @@ from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, Rule, keep, kind_of
 if TYPE_CHECKING:
     from torchrl_mpfa.samplers.table import SignalTable
 
-Level = float | Literal["mean"]
-"""A reward, or ``"mean"``: the mean reward of the buffer."""
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 _BOUND: Rule = (lambda word: word in get_args(Bound), "'floor', 'cap' or 'none'")

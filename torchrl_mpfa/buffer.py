@@ -324,24 +324,24 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         As in TorchRL the data are not copied: save or copy the state before more is written, after
         which the state is rejected. Batches that were sampled ahead are forgotten.
         """
-        return self._state(lambda part: part.state_dict())
-
-    def _state(self, state_of: Callable[[Any], Any]) -> dict[str, Any]:
         self._settle()
         with self._replay_lock, self._write_lock:
-            # The properties, not the attributes: with delayed_init the parts are made here.
-            parts = {f"_{name}": state_of(getattr(self, name)) for name in _PARTS}
-            source = self._rng
-            return {
-                **parts,
-                "_transforms": self._transform.state_dict(),
-                "_batch_size": self._batch_size,
-                "_consume_after_n_samples": self._consume_after_n_samples,
-                "_rng": None if source is None else (source.get_state(), str(source.device)),
-                # By which the data, no copies, are seen to be no longer those of the state.
-                _CLOCK: self._clock,
-                _TIME: self._clock[0],
-            }
+            return self._state(lambda part: part.state_dict())
+
+    def _state(self, state_of: Callable[[Any], Any]) -> dict[str, Any]:
+        # The properties, not the attributes: with delayed_init the parts are made here.
+        parts = {f"_{name}": state_of(getattr(self, name)) for name in _PARTS}
+        source = self._rng
+        return {
+            **parts,
+            "_transforms": self._transform.state_dict(),
+            "_batch_size": self._batch_size,
+            "_consume_after_n_samples": self._consume_after_n_samples,
+            "_rng": None if source is None else (source.get_state(), str(source.device)),
+            # By which the data, no copies, are seen to be no longer those of the state.
+            _CLOCK: self._clock,
+            _TIME: self._clock[0],
+        }
 
     @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -427,6 +427,8 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             pickle.UnpicklingError: If the data hold anything but tensors and plain values; nothing
                 is written.
         """
+        # Before the locks, which a batch that is sampled ahead waits for.
+        self._settle()
         with self._replay_lock, self._write_lock:
             dump(self._state(state_of), path)
 

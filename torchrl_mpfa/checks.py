@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from numbers import Integral
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+Level = float | Literal["mean"]
+"""A reward, or ``"mean"``: the mean reward of the buffer."""
 Rule = tuple[Callable[[Any], bool], str]
 """Test of a value, and in words what the value must be."""
 

@@ -37,10 +37,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import (
     BELOW_ONE,
     NOT_NEGATIVE,
+    Level,
     Rule,
     check,
     check_not_negative,

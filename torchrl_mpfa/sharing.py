@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import torch
 from tensordict import MemoryMappedTensor
 from torch.utils._pytree import tree_leaves
 from torchrl.data import RandomSampler, RoundRobinWriter
-
-if TYPE_CHECKING:
-    from torchrl_mpfa.writes import CheckedReplayBuffer
 
 _RAY = "torchrl_mpfa.integrations.ray.make_ray_replay has a buffer that any process may write to"
 
@@ -42,7 +39,7 @@ class SharedWrites:
     TorchRL's lock is another object, which one process cannot take twice.
     """
 
-    def __init__(self, buffer: CheckedReplayBuffer) -> None:
+    def __init__(self, buffer: Any) -> None:
         self._buffer, self._lock, self._depth = buffer, multiprocessing.RLock(), 0
         self._seen = self._count()
 
@@ -85,7 +82,7 @@ class SharedWrites:
         buffer._clock[0] += 1
 
 
-def check_shared(buffer: CheckedReplayBuffer) -> None:
+def check_shared(buffer: Any) -> None:
     """Reject a buffer of which another process would get a copy, or whose slots it cannot name."""
     storage = buffer._storage
     for name, fits in (

@@ -22,8 +22,7 @@ from unittest.mock import patch
 from benchmarks.speed.replay import BATCH_SIZE, make_mpfa_buffer, make_mpfa_update
 from benchmarks.speed.timing import MICROSECONDS, Call, few_threads
 from benchmarks.speed.training import Agent, IdleTorchEnv, make_loop
-from torchrl_mpfa import ActorCritic, SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.samplers import fused
+from torchrl_mpfa import ActorCritic, SignalReplayBuffer, SignalSampler, SignalTensorStorage
 from training.run.assembly import has_compiler
 
 Part = tuple[Any, str]
@@ -38,12 +37,12 @@ STEP: dict[str, Part] = {
 }
 SAMPLE: dict[str, Part] = {
     "sample": (SignalReplayBuffer, "sample"),
-    "– slots, weights, counts and times, Eqs. (8), (10)": (fused, "sample_compiled"),
+    "– slots, weights, counts and times, Eqs. (8), (10)": (SignalSampler, "sample"),
     "– entries of the batch": (SignalTensorStorage, "batch"),
 }
 UPDATE: dict[str, Part] = {
     "update": (SignalReplayBuffer, "update_tensordict_priority"),
-    "– signals, priorities and leaves, Eqs. (8), (13)-(24)": (fused, "update_compiled"),
+    "– signals, priorities and leaves, Eqs. (8), (13)-(24)": (SignalSampler, "update_signals"),
 }
 _FIRST = 20
 """Calls that are not counted: they compile, and fill caches."""

@@ -75,6 +75,12 @@ def permutation_p(ours: Array, theirs: Array) -> float:
         # What is equal but for rounding counts as equal.
         return np.asarray(abs(x.mean(axis=axis) - y.mean(axis=axis)).round(12))
 
+    if math.comb(len(ours) + len(theirs), len(ours)) > _PERMUTATIONS:
+        # As SciPy would, which makes an index of each permutation and takes twice as long.
+        both = np.tile(np.concatenate([ours, theirs]), (_PERMUTATIONS, 1))
+        dealt = np.random.default_rng(0).permuted(both, axis=1)
+        gaps = gap(dealt[:, : len(ours)], dealt[:, len(ours) :], 1)
+        return float((1 + (gaps >= gap(ours, theirs, 0)).sum()) / (1 + _PERMUTATIONS))
     return _share((ours, theirs), gap, permutation_type="independent")
 
 

@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 import torch
 from hydra.core.config_store import ConfigStore
 
+from training import pictures
 from training.records import write_table
 from training.settings.train import register
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_store() -> Iterator[None]:
-    """Hydra copies all settings that it knows to compose some: 0.1 s, as often as tests do so."""
+    """Hydra copies all settings that it knows to compose some: 0.1 s, as often as tests do so.
+
+    Each script makes them known anew, which takes as long: those that are known as they are stay.
+    """
+    store, known = ConfigStore.store, dict[Any, Any]()
+
+    def store_once(self: ConfigStore, name: str, node: Any, **place: Any) -> None:
+        group, told = place.get("group"), (type(node), repr(node), place)
+        there = f"{name}.yaml" in (self.repo.get(group, {}) if group else self.repo)
+        if not there or known.get((group, name)) != told:
+            store(self, name, node, **place)
+            known[group, name] = told
+
     with pytest.MonkeyPatch.context() as patch:
         # What is loaded from the store is a copy in any case.
         patch.setattr(ConfigStore, "__deepcopy__", lambda store, _: store, raising=False)
+        patch.setattr(ConfigStore, "store", store_once)
         register()
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_films() -> Iterator[None]:
+    """Film an episode in nine pictures: a hundred of them take longer than all else of a run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pictures, "film_episode", partial(pictures.film_episode, most=8))
         yield
 
 

@@ -93,7 +93,8 @@ def test_methods_that_ask_for_more_than_a_buffer_and_a_loss_are_named_by_what_th
 @pytest.mark.filterwarnings("ignore:none of the .* rewards in the buffer are above")
 def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     short = ["--task", "Pendulum-v1", "--steps", "200", "--start", "150", "--every", "200"]
-    command = [*short, "--folder", str(tmp_path)]
+    # A program of the updates takes half a minute to compile.
+    command = [*short, "--eager", "--folder", str(tmp_path)]
     monkeypatch.setattr(gymnasium_td3, "EPISODES", 2)
     folder = gymnasium_td3.main(command)
     rows = scores_in(folder)

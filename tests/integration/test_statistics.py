@@ -27,6 +27,19 @@ def test_the_least_p_is_that_of_runs_that_differ_as_much_as_they_can() -> None:
         assert found.p == pytest.approx(found.least)
 
 
+def test_permutation_p_of_many_runs_is_that_of_scipy_to_the_last_bit() -> None:
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(0.5, 1.0, 12), rng.normal(0.0, 1.0, 20)
+
+    def gap(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return abs(x.mean(axis=axis) - y.mean(axis=axis)).round(12)
+
+    expected = stats.permutation_test(
+        (ours, theirs), gap, n_resamples=50_000, alternative="greater", vectorized=True, rng=0
+    )
+    assert permutation_p(ours, theirs) == expected.pvalue
+
+
 def test_difference_interval_is_that_of_scipy() -> None:
     rng = np.random.default_rng(0)
     ours, theirs = rng.normal(1.0, 3.0, 5), rng.normal(0.0, 1.0, 20)

@@ -134,8 +134,8 @@ def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
     assert all(networks[0][name].equal(networks[1][name]) for name in networks[0])
     mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
     assert torch.equal(mine["_rng"][0], other["_rng"][0])
-    if "_leaves" in other["_sampler"]:
-        assert torch.equal(mine["_sampler"]["_leaves"], other["_sampler"]["_leaves"])
+    if "_sum_tree" in other["_sampler"]:
+        assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
     if "_signals" in other["_storage"]:
         signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
         # NaN marks what is not known yet.

@@ -53,7 +53,7 @@ COMMON = [
         (name, MISSING, f"'{name}' is missing in the saved sampler")
         for name in (
             *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_highest_slot", "_kind"),
-            *("_format", "_priorities", "_learned", "_leaves", "_signals"),
+            *("_format", "_priorities", "_learned", "_sum_tree", "_signals"),
             *("_weights", "_weighed_at", "_mean_reward"),
         )
     ],
@@ -62,11 +62,11 @@ COMMON = [
     ("_eps", lambda _: -1.0, "eps must be finite and not negative, got -1.0"),
     ("_format", lambda _: 99, "'_format' of the saved sampler must be 5, got 99"),
     ("_max_capacity", lambda _: 10**18, "'_max_capacity' of the saved sampler must be 12, got 10"),
-    ("_leaves", with_nan, "'_leaves' of the saved sampler must be finite and not neg"),
-    ("_leaves", lambda t: t[:3], r"'_leaves' .* must be torch.float64 of shape \[12\], got"),
-    ("_leaves", lambda t: t.float(), r"'_leaves' .*got torch.float32 of shape \[12\]"),
-    ("_leaves", lambda _: [1.0], "'_leaves' of the saved sampler must be torch.float64 of"),
-    ("_leaves", lambda t: t * 0 + 1e308, "'_leaves' .* must have a finite sum, got inf"),
+    ("_sum_tree", with_nan, "'_sum_tree' of the saved sampler must be finite and not neg"),
+    ("_sum_tree", lambda t: t[:3], r"'_sum_tree' .* must be torch.float64 of shape \[12\], got"),
+    ("_sum_tree", lambda t: t.float(), r"'_sum_tree' .*got torch.float32 of shape \[12\]"),
+    ("_sum_tree", lambda _: [1.0], "'_sum_tree' of the saved sampler must be torch.float64 of"),
+    ("_sum_tree", lambda t: t * 0 + 1e308, "'_sum_tree' .* must have a finite sum, got inf"),
     ("_priorities", lambda t: -t, "'_priorities' of the saved sampler must be finite and not neg"),
     ("_learned", lambda t: t.int(), r"'_learned' of the saved sampler must be torch.bool"),
     ("_weights", lambda _: {"x": 1.0}, "'_weights' of the saved sampler must be of the signals"),
@@ -78,7 +78,7 @@ OWN = [
     ("rank_per", "_order", lambda t: t.flip(0), "'_order' of the saved sampler must be of rising"),
     ("mw", "_spent", MISSING, "'_spent' is missing"),
     ("mw", "_spent", lambda t: t.float(), "'_spent' of the saved sampler must be torch.bool"),
-    ("la3p", "_leaves", torch.zeros_like, "'_leaves' of the saved sampler must be positive"),
+    ("la3p", "_sum_tree", torch.zeros_like, "'_sum_tree' of the saved sampler must be positive"),
     ("cer", "newest", MISSING, "'newest' is missing"),
     ("geometric", "newest", MISSING, "'newest' is missing"),
 ]

@@ -1,5 +1,7 @@
 """SignalReplayBuffer: from batch to sampler, beside TorchRL's other parts; its warnings."""
 
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor, wait
 
 import pytest
@@ -230,6 +232,22 @@ def test_batches_of_a_uniform_sampler_are_sampled_ahead_and_forgotten_with_the_b
         assert buffer.sample()["index"].equal(twin.sample()["index"])
         return
     assert all(buffer.sample()["observation"].min() >= 100 for _ in range(5))
+
+
+def test_a_dump_does_not_wait_for_a_batch_that_waits_for_it(tmp_path):
+    class Slow(RandomSampler):
+        def sample(self, *args, **kwargs):
+            time.sleep(0.2)
+            return super().sample(*args, **kwargs)
+
+    parts = {"storage": SignalTensorStorage(16), "sampler": Slow()}
+    buffer = SignalReplayBuffer(**parts, batch_size=8, prefetch=3)
+    buffer.extend(make_transitions(16))
+    buffer.sample()
+    saving = threading.Thread(target=buffer.dumps, args=(tmp_path / "buffer",), daemon=True)
+    saving.start()
+    saving.join(20)
+    assert not saving.is_alive()
 
 
 @pytest.mark.filterwarnings("ignore:Calling update_priority:UserWarning")

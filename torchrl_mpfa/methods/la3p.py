@@ -113,7 +113,7 @@ class LA3PSampler(SignalSampler):
         if len(slots := self._known()):
             leaves = self.trees.leaves(slots)
             if not bool((leaves > 0).all()):
-                raise ValueError("'_leaves' of the saved sampler must be positive, got 0")
+                raise ValueError("'_sum_tree' of the saved sampler must be positive, got 0")
             self._inverse.put(slots, 1.0 / leaves)
 
 

@@ -29,11 +29,14 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "put": (_I, [_P, _P, _P, _I, _P, _P, _P, _I]),
     "query": (_D, [_P, _P, _P, _I, _I, _I]),
     "find": (None, [_P, _P, _I, _I, _P, _I, _P, _P]),
+    "waits": (_I, []),
+    "ask": (None, [_P, _I, _P, _I, _I]),
     "gather": (_I, [_P, _I, _P, _I, _I]),
     "not_finite": (_I, [_P, _I, _I]),
     "scatter": (_I, [_P, _I, _P, _I, _I]),
-    "take": (_I, [_P, _I, _I, _I, _P, _I, _I, _P]),
-    "give": (_I, [_P, _I, _I, _P, _I, _I, _P]),
+    "join": (_I, [_P, _I, _P, _I, _I, _P, _P, _I, _I, _P]),
+    "give": (_I, [_P, _I, _I, _P, _I, _I, _P, _I]),
+    "describe": (_I, [_P, _I, _I, _I, _P]),
     "tally": (None, [_P, _I, _I, _P, _I]),
 }
 

@@ -1,7 +1,14 @@
 // Loops of prioritized replay: trees and rows. A caller has checked types, devices and lengths.
+#define _GNU_SOURCE  // RUSAGE_THREAD.
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include <sys/mman.h>
+#include <sys/resource.h>
+#include <unistd.h>
+#ifndef RUSAGE_THREAD
+#define RUSAGE_THREAD RUSAGE_SELF
+#endif
 
 enum {
   WIDE = 16,  // Children of a node, also in trees.py.
@@ -191,6 +198,23 @@ typedef struct {
   int64_t number;  // 4 or 8: single or double precision, which must be finite; else 0.
 } Column;
 
+// How often this thread waited for a page of a file.
+int64_t waits(void) {
+  struct rusage usage;
+  return getrusage(RUSAGE_THREAD, &usage) ? 0 : usage.ru_majflt;
+}
+
+// Have the system read the pages of rows all at once, where each would be waited for when it is touched.
+void ask(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
+  uintptr_t page = sysconf(_SC_PAGESIZE);
+  if (outside(slots, n, end)) return;
+  for (int64_t c = 0; c < count; c++)
+    for (int64_t i = 0; columns[c].bytes && i < n; i++) {
+      uintptr_t row = (uintptr_t)(columns[c].stored + slots[i] * columns[c].bytes), first = row / page * page;
+      madvise((void *)first, row + columns[c].bytes - first, MADV_WILLNEED);
+    }
+}
+
 // Copy rows of slots. Returns 1, and does nothing, if a slot is not below `end`.
 int64_t gather(const Column *columns, int64_t count, const int64_t *slots, int64_t n, int64_t end) {
   if (outside(slots, n, end)) return 1;
@@ -238,23 +262,55 @@ int64_t scatter(const Column *columns, int64_t count, const int64_t *slots, int6
 
 // A table of numbers: rows of `width` numbers, and in a batch its columns one after the other.
 
-// Copy so many columns from a first one on. Returns 1, and does nothing, if a slot is not below `end`.
-int64_t take(const double *table, int64_t width, int64_t first, int64_t count, const int64_t *slots, int64_t n,
-             int64_t end, double *batch) {
+// Copy whole rows, with new numbers in their first columns. Returns 1 if a slot is not below `end`, was written
+// since, as its last column shows, or has a number that is negative or not finite in the columns to be checked.
+int64_t join(const double *table, int64_t width, const int64_t *slots, int64_t n, int64_t end,
+             const double *written, const float *const *numbers, int64_t count, int64_t checked, double *batch) {
   if (outside(slots, n, end)) return 1;
   for (int64_t i = 0; i < n; i++) {
-    __builtin_prefetch(table + slots[i + AHEAD < n ? i + AHEAD : i] * width + first);
-    for (int64_t k = 0; k < count; k++) batch[k * n + i] = table[slots[i] * width + first + k];
+    const double *row = table + slots[i] * width;
+    __builtin_prefetch(table + slots[i + AHEAD < n ? i + AHEAD : i] * width, 1);
+    if (written && row[width - 1] != written[i]) return 1;
+    for (int64_t k = count; k < width; k++) batch[k * n + i] = row[k];
+  }
+  int64_t wrong = 0;
+  for (int64_t k = 0; k < count; k++)
+    for (int64_t i = 0; i < n; i++) batch[k * n + i] = (double)numbers[k][i];
+  for (int64_t j = 0; j < checked * n; j++) wrong |= !(batch[j] >= 0.0 && batch[j] < INFINITY);
+  return wrong;
+}
+
+// Write the first columns of a batch; the last one of all becomes a time that rises from `time` on, unless this
+// is negative. Returns 1, and writes nothing, if a slot is not below `end`.
+int64_t give(double *table, int64_t width, int64_t count, const int64_t *slots, int64_t n, int64_t end,
+             const double *batch, int64_t time) {
+  if (outside(slots, n, end)) return 1;
+  for (int64_t i = 0; i < n; i++) {
+    double *row = table + slots[i] * width;
+    for (int64_t k = 0; k < count; k++) row[k] = batch[k * n + i];
+    if (time >= 0) row[width - 1] = (double)(time + i);
   }
   return 0;
 }
 
-// Write the first columns of a batch. Returns 1, and writes nothing, if a slot is not below `end`.
-int64_t give(double *table, int64_t width, int64_t count, const int64_t *slots, int64_t n, int64_t end,
-             const double *batch) {
-  if (outside(slots, n, end)) return 1;
-  for (int64_t i = 0; i < n; i++)
-    for (int64_t k = 0; k < count; k++) table[slots[i] * width + k] = batch[k * n + i];
+typedef struct {
+  const void *numbers;
+  int64_t bytes;      // Of a number: 4 or 8, single or double precision.
+  int64_t column;     // Where it is put.
+  int64_t is_signed;  // If it may be negative.
+} Source;
+
+// Rows of new transitions: some columns have numbers of theirs, the last but one is zero, all else is NaN.
+// Returns 1 if one of the numbers is not finite, or negative.
+int64_t describe(const Source *sources, int64_t count, int64_t width, int64_t n, double *batch) {
+  for (int64_t j = 0; j < width * n; j++) batch[j] = NAN;
+  for (int64_t i = 0; i < n; i++) batch[(width - 2) * n + i] = 0.0;
+  for (const Source *s = sources; s < sources + count; s++)
+    for (int64_t i = 0; i < n; i++) {
+      double v = s->bytes == 4 ? ((const float *)s->numbers)[i] : ((const double *)s->numbers)[i];
+      if (!(fabs(v) < INFINITY && (s->is_signed || v >= 0.0))) return 1;
+      batch[s->column * n + i] = v;
+    }
   return 0;
 }
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import PositiveBoost
 from torchrl_mpfa.samplers.prioritized import TreeSampler
-
-if TYPE_CHECKING:
-    from torchrl_mpfa.samplers.fused import SignalSampler
-    from torchrl_mpfa.samplers.weighing import Weighing
+from torchrl_mpfa.samplers.weighing import Fusing, Weighing
 
 
 def composition(
-    sampler: SignalSampler, weighing: Weighing | None, batch: tuple[Tensor, Tensor] | None
+    sampler: Fusing, weighing: Weighing | None, batch: tuple[Tensor, Tensor] | None
 ) -> dict[str, float]:
     """Return numbers of the buffer, and of slots and weights of its last batch, by name."""
     table, weights = sampler.table, sampler.weights

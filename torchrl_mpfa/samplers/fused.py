@@ -12,8 +12,16 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage, TensorStorage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Level, check_adjustments
-from torchrl_mpfa.checks import LEVEL, NOT_NEGATIVE, check, check_counts, check_index, check_shape
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, check_adjustments
+from torchrl_mpfa.checks import (
+    LEVEL,
+    NOT_NEGATIVE,
+    Level,
+    check,
+    check_counts,
+    check_index,
+    check_shape,
+)
 from torchrl_mpfa.fusion import FixedFusion, Fusion, check_fusion, fuse
 from torchrl_mpfa.samplers.composition import composition
 from torchrl_mpfa.samplers.prioritized import TreeSampler
@@ -161,6 +169,11 @@ class SignalSampler(TreeSampler):
         check_adjustments(adjustments)
         self._adjustments, self._weighing = tuple(adjustments), None
         self._counting = [adjust.counts for adjust in adjustments]
+
+    @property
+    def recounts(self) -> bool:
+        """True if fusion or adjustments count at each update, or may have to."""
+        return self.fusion.every_batch or any(self._counting)
 
     @property
     def reward_key(self) -> NestedKey:
@@ -344,11 +357,9 @@ class SignalSampler(TreeSampler):
         if slots.numel() == 0:
             return 0
         slots = slots.to(table.device)
-        rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
-        stale = 0 if live is None else live.numel() - slots.numel()
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
-        table.fill_learned(rows, signals, live, sizes)
-        table.check_fused(rows)
+        rows, slots, live, sizes = table.learned_rows(slots, signals, written_at, batches)
+        stale = 0 if live is None else live.numel() - slots.numel()
         if slots.numel() == 0:
             return stale
         # One group of all batches where that is allowed, else a group for each batch.
@@ -384,7 +395,8 @@ class SignalSampler(TreeSampler):
     ) -> Tensor:
         """Return priorities of so many batches by Eqs. (21)-(24), eps included, ``[U * B]``."""
         priority = self.combined(rows, weighing)
-        *_, reward, replay_count, written_at = rows.unbind(1)
+        columns = table.reward_column, table.count_column, table.time_column
+        reward, replay_count, written_at = (rows.select(1, column) for column in columns)
         numbers = [priority, reward, replay_count, slots, written_at]
         if batches > 1:
             numbers = [number.view(batches, -1) for number in numbers]
@@ -396,7 +408,7 @@ class SignalSampler(TreeSampler):
                 facts = replace(facts, counted=weighing.counted[place])
             name = f"priorities of {type(adjust).__name__}"
             priority = check_shape(name, adjust(priority, facts), slots.shape)
-        return priority.to(torch.double).reshape(-1)
+        return priority.double().reshape(-1) if batches > 1 else priority.double()
 
     def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Return priorities by Eq. (21), eps included, shape ``[B]``."""

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from tensordict.utils import NestedKey
 
-from torchrl_mpfa.adjustment import Adjustment, Level, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
+from torchrl_mpfa.checks import Level
 from torchrl_mpfa.fusion import EntropyFusion, Fusion
 from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.samplers.table import Agents

@@ -22,7 +22,7 @@ from torchrl_mpfa.checks import (
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each, random_shares
 from torchrl_mpfa.samplers.states import SavedTrees
-from torchrl_mpfa.samplers.trees import is_learned, make_trees
+from torchrl_mpfa.samplers.trees import HasTrees, is_learned, make_trees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _LOG_POSITIVE = math.log(1e-200)
@@ -31,7 +31,7 @@ _CPU = torch.device("cpu")
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
-class TreeSampler(SavedTrees):
+class TreeSampler(HasTrees, SavedTrees):
     r"""Proportional sampling from segment trees, Eqs. (8) and (10).
 
     The batches and weights of :class:`~torchrl.data.replay_buffers.PrioritizedSampler`, with
@@ -321,7 +321,7 @@ class TreeSampler(SavedTrees):
         """Give the transitions in slots the highest priority."""
         priority = self._fresh_priority()
         if self._highest is None:
-            self.keep_highest(float(priority), int(slots[0]))
+            self._keep_highest(float(priority), int(slots[0]))
         fresh = slots.new_empty(slots.shape, dtype=torch.double).fill_(priority)
         self._write(slots, fresh, learned=False)
 
@@ -410,9 +410,9 @@ class TreeSampler(SavedTrees):
         self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
             stored = self.priorities(slots)  # Of a slot that is named twice the last one.
-            self.keep_highest(float(stored.max()), int(slots[stored.argmax()]))
+            self._keep_highest(float(stored.max()), int(slots[stored.argmax()]))
 
-    def keep_highest(self, highest: float, slot: int) -> None:
+    def _keep_highest(self, highest: float, slot: int) -> None:
         """Keep a priority and its slot if none was as high so far."""
         if self._highest is None or highest > self._highest:
             self._highest, self._highest_slot = highest, slot

@@ -83,8 +83,8 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batches depend on but for the generator, on the CPU.
 
-        ``_learned`` is true where a priority was learned, and ``_leaves`` are -0.0 where a slot
-        cannot be sampled.
+        ``_learned`` is true where a priority was learned. Leaves, ``_sum_tree``, are -0.0 where a
+        slot cannot be sampled.
         """
         slots = torch.arange(self._max_capacity, device=self.device)
         kept = self.trees.priorities
@@ -94,28 +94,30 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
             "_max_capacity": self._max_capacity,
             "_priorities": kept.abs().cpu(),
             "_learned": is_learned(kept).cpu(),
-            "_leaves": self.trees.leaves(slots).cpu(),
+            "_sum_tree": self.trees.leaves(slots).cpu(),
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
-        names, size = ("_priorities", "_learned", "_leaves"), self._max_capacity
+        names, size = ("_priorities", "_learned", "_sum_tree"), self._max_capacity
         check_saved("sampler", state, names, _max_capacity=size)
         self._init()
         super()._restore(state)
         check(NOT_NEGATIVE, alpha=self._alpha, beta=self._beta, eps=self._eps)
         kept = self.trees.priorities
-        priorities, leaves = (alike(name, state[name], kept) for name in ("_priorities", "_leaves"))
+        priorities, leaves = (
+            alike(name, state[name], kept) for name in ("_priorities", "_sum_tree")
+        )
         learned = alike("_learned", state["_learned"], kept.isnan())
         # NaN where nothing was written, and there trees are left as they are made.
         slots = (~priorities.isnan()).nonzero().squeeze(1)
         priorities, leaves = priorities[slots], leaves[slots]
         check_not_negative("'_priorities' of the saved sampler", priorities)
-        check_not_negative("'_leaves' of the saved sampler", leaves)
+        check_not_negative("'_sum_tree' of the saved sampler", leaves)
         if len(slots):
             signed = torch.where(learned[slots], priorities, -priorities)
             self.trees.put(slots, leaves, signed)
         if not bool(self.trees.sum(size) < math.inf):
-            raise ValueError("'_leaves' of the saved sampler must have a finite sum, got inf")
+            raise ValueError("'_sum_tree' of the saved sampler must have a finite sum, got inf")
 
 
 def alike(name: str, saved: Any, own: Any) -> Any:

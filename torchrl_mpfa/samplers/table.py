@@ -11,9 +11,9 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Level
 from torchrl_mpfa.checks import (
     COUNT_OR_ZERO,
+    Level,
     bounds,
     check,
     check_counts,
@@ -21,7 +21,7 @@ from torchrl_mpfa.checks import (
     check_not_negative,
     check_shape,
 )
-from torchrl_mpfa.native import address, find_loops, loops, opaque
+from torchrl_mpfa.native.tables import describe, fits, give, has_loops, join, tally
 from torchrl_mpfa.saving import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
@@ -133,6 +133,8 @@ class SignalTable:
             KeyError: If ``whole`` and an entry is missing.
             ValueError: If one is no finite number for each transition, or a signal is negative.
         """
+        if (rows := self._described(data, count)) is not None:
+            return rows
         reward = self._column(data, self.reward_key, "reward", count)
         rows = self.blank(count, "cpu" if reward is None else reward.device)
         for signal in self.written:
@@ -147,6 +149,53 @@ class SignalTable:
         elif whole:
             raise KeyError(_LACKS.format("reward", self.reward_key))
         return rows
+
+    def _described(self, data: Any, count: int) -> Tensor | None:
+        """Return rows for new transitions by a loop; None where PyTorch has to, or finds fault."""
+        if not has_loops(self.rows):
+            return None
+        reward = data.get(self.reward_key, None)
+        numbers = [(reward, self.reward_column)]
+        for signal in self.written:
+            same = signal.key == self.reward_key
+            value = reward if same else data.get(signal.key, None)
+            if not fits(value, count, torch.float, torch.double):
+                return None
+            priority = _priority(signal, value.detach().reshape(count))
+            numbers.append((priority, self.column[signal.name]))
+        return describe(self.rows, numbers, count)
+
+    def learned_rows(
+        self,
+        slots: Tensor,
+        signals: Mapping[str, Tensor],
+        written_at: Tensor | None,
+        batches: int,
+    ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
+        """Return copies of live rows with new learned signals, and as :meth:`_live_rows`.
+
+        Raises:
+            KeyError: If a signal is missing.
+            IndexError: If a slot is not filled.
+            ValueError: If a signal is negative, not finite or of another shape, or the slots are
+                not so many equal batches.
+        """
+        new = [signals.get(s.name) for s in self.learned if s.priority is None]
+        equal = type(batches) is int and batches > 0 and slots.numel() % batches == 0
+        if equal and len(new) == len(self.learned) and has_loops(self.rows):
+            end = self._reachable(written_at)
+            rows = join(self.rows, slots, new, written_at, end, self.fused.stop)
+            if rows is not None:
+                return rows, slots, None, [slots.numel() // batches] * batches
+        rows, slots, live, sizes = self._live_rows(slots, written_at, batches)
+        self.fill_learned(rows, signals, live, sizes)
+        self._check_fused(rows)
+        return rows, slots, live, sizes
+
+    def _reachable(self, written_at: Tensor | None) -> int:
+        """Return the slots that a batch may be of."""
+        # A batch from before the table was cleared is stale, as its times of writing show.
+        return self.size if written_at is None else max(self.size, self.cleared)
 
     def fill_learned(
         self, rows: Tensor, signals: Mapping[str, Tensor], live: Tensor | None, sizes: Sequence[int]
@@ -167,7 +216,7 @@ class SignalTable:
                 if len(one):
                     into.copy_(_priority(signal, one))
 
-    def check_fused(self, rows: Tensor) -> None:
+    def _check_fused(self, rows: Tensor) -> None:
         """Reject rows whose signals cannot be fused: missing, negative or not finite."""
         if rows.numel() == 0:
             return
@@ -182,25 +231,19 @@ class SignalTable:
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_not_negative(f"signal {name!r}", value)
 
-    def live_rows(
+    def _live_rows(
         self, slots: Tensor, written_at: Tensor | None, batches: int
     ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
         """Return live rows and slots, the mask of live ones, and the sizes of batches."""
-        # A batch from before the table was cleared is stale, as its times of writing show.
-        filled = self.size if written_at is None else max(self.size, self.cleared)
+        filled = self._reachable(written_at)
         if type(batches) is not int or batches < 1:
             check_counts(batches=batches)
         count = slots.numel()
         if count % batches:
             raise ValueError(f"{count} slots cannot make {batches} equal batches")
-        rows, sizes = (
-            self._taken(slots, 0, self.rows.shape[1], filled),
-            [count // batches] * batches,
-        )
-        if rows is None:
-            if check_index(slots, filled).numel() < count:
-                raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-            rows = self.rows.index_select(0, slots)
+        if check_index(slots, filled).numel() < count:
+            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
+        rows, sizes = self.rows.index_select(0, slots), [count // batches] * batches
         if written_at is None:
             return rows, slots, None, sizes
         if written_at.numel() != count:
@@ -253,61 +296,33 @@ class SignalTable:
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
         index, rows = index.to(self.device), rows.to(self.device)
-        if count == 1:
-            rows[0, self.time_column] = self.writes
+        if has_loops(self.rows):
+            give(self.rows, index, rows, self.rows.shape[1] - 1, time=self.writes)
         else:
             times = torch.arange(self.writes, self.writes + count, device=self.device)
             rows[:, self.time_column] = times
-        self.rows[index] = rows
+            self.rows[index] = rows
         self.writes += count
 
-    @property
-    def _by_c(self) -> bool:
-        """True if compiled loops read and write the rows."""
-        return self.rows.is_cpu and find_loops() is not None
-
-    @opaque
-    def _taken(self, slots: Tensor, first: int, count: int, filled: int) -> Tensor | None:
-        """Return so many columns of slots, shape ``[B, count]``; each lies in one piece.
-
-        None where PyTorch has to take them, or a slot is not filled.
-        """
-        if not self._by_c:
-            return None
-        slots = slots.contiguous()
-        columns = torch.empty((count, slots.numel()), dtype=torch.double, device="cpu")
-        batch = address(slots, torch.long), slots.numel(), min(filled, self.capacity)
-        place = self.rows.data_ptr(), self.rows.shape[1], first, count
-        return None if loops().take(*place, *batch, columns.data_ptr()) else columns.T
-
-    @opaque
     def learn(self, slots: Tensor, rows: Tensor) -> None:
-        """Write the learned signals of rows of :meth:`live_rows`; the last of a slot counts."""
-        learned = rows[:, : len(self.learned)]
-        if self._by_c:
-            columns, slots = learned.T.contiguous(), slots.contiguous()
-            batch = address(slots, torch.long), slots.numel(), self.capacity
-            place = self.rows.data_ptr(), self.rows.shape[1], len(self.learned)
-            loops().give(*place, *batch, columns.data_ptr())
+        """Write the learned signals of rows of :meth:`_live_rows`; the last of a slot counts."""
+        count = len(self.learned)
+        if has_loops(self.rows):
+            give(self.rows, slots, rows, count)
         else:
-            self.rows[:, : len(self.learned)].index_copy_(0, slots, learned)
+            self.rows[:, :count].index_copy_(0, slots, rows[:, :count])
 
-    @opaque
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
-        if self._by_c:
-            place = self.rows.data_ptr(), self.rows.shape[1], self.count_column
-            loops().tally(*place, address(index, torch.long), index.numel())
+        if has_loops(self.rows):
+            tally(self.rows, self.count_column, index)
         else:
             one = torch.ones(len(index), dtype=torch.double, device=self.device)
             self.rows.select(1, self.count_column).index_add_(0, index, one)
 
     def written_at(self, index: Tensor) -> Tensor:
         """Return the time of writing of each slot, a count of writes, shape ``[B]``."""
-        times = self._taken(index, self.time_column, 1, self.capacity)
-        if times is None:
-            return self.rows.select(1, self.time_column).index_select(0, index)
-        return times.squeeze(1)
+        return self.rows.select(1, self.time_column).index_select(0, index)
 
     def replay_counts(self, index: Tensor) -> Tensor:
         """Return the replays of each slot, shape ``[B]``."""
@@ -362,7 +377,9 @@ def _priority(signal: Signal, value: Tensor) -> Tensor:
 
 
 def _written_priority(signal: Signal, value: Tensor) -> Tensor:
-    """Return the priorities of a signal known at the write, finite and not negative."""
+    """Return the priorities of a signal known at the write, of finite numbers."""
+    if signal.priority is None:
+        return value.abs()
     priority = _priority(signal, value)
     low, high = bounds(priority)
     if not (low >= 0 and high < math.inf):

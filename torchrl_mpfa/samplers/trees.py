@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
-from torchrl_mpfa.native import address, find_loops, loops, opaque
+from torchrl_mpfa.native import address, find_loops, is_plain, loops, opaque
 
 _WIDE = 16
 """Children of a node of compiled trees, also in ``replay.c``."""
@@ -73,18 +73,17 @@ class CompiledTrees:
     @opaque
     def put(self, slots: Tensor, leaf: Tensor, priority: Tensor | None = None) -> None:
         """Set leaves of slots, and their priorities where these are given, each ``[B]``."""
-        slots, leaf = slots.contiguous(), leaf.double().contiguous()
-        priority = None if priority is None else priority.double().contiguous()
-        values = None if priority is None else address(priority, torch.double)
+        count, slots, leaf = slots.numel(), slots.contiguous(), _numbers(leaf)
+        priority = None if priority is None else _numbers(priority)
         if loops().put(
             self._leaf.data_ptr(),
             self._priority.data_ptr(),
             self._nodes.data_ptr(),
             self._size,
             address(slots, torch.long),
-            address(leaf, torch.double),
-            values,
-            slots.numel(),
+            leaf.data_ptr(),
+            None if priority is None else priority.data_ptr(),
+            count,
         ):
             raise IndexError(f"slots must be in [0, {self._size}), got {slots.tolist()}")
 
@@ -123,6 +122,12 @@ class CompiledTrees:
         parts = self._leaf.data_ptr(), self._priority.data_ptr(), self._nodes.data_ptr()
         result: float = loops().query(*parts, kind, self._size, size)
         return result
+
+
+def _numbers(values: Tensor) -> Tensor:
+    """Return values as C reads them."""
+    fits = values.dtype is torch.double and is_plain(values)
+    return values if fits else values.to("cpu", torch.double).resolve_neg().contiguous()
 
 
 def _filled(number: float, count: int) -> Tensor:
@@ -203,6 +208,42 @@ class PlainTrees:
     def highest(self) -> Any:
         """Return the highest priority that was learned, negative if none was."""
         return -self._highs.query(0, self._size)
+
+
+class ReadTree:
+    """The tree of sums or of minima, as far as TorchRL reads it.
+
+    Args:
+        trees: Trees of all kinds.
+        minimum: True for that of minima.
+    """
+
+    def __init__(self, trees: CompiledTrees | PlainTrees, *, minimum: bool) -> None:
+        self._trees, self._minimum = trees, minimum
+
+    def __getitem__(self, slots: Any) -> Tensor:
+        leaves = self._trees.leaves(torch.as_tensor(slots).reshape(-1))
+        return leaves.where(~leaves.signbit(), _MOST) if self._minimum else leaves
+
+    def query(self, start: int, end: int) -> Any:
+        """Return the sum or minimum of the leaves from ``start``, which is 0, to before ``end``."""
+        if start:
+            raise ValueError(f"start must be 0, got {start}: sum up the leaves of the slots")
+        return self._trees.lowest(end) if self._minimum else self._trees.sum(end)
+
+
+class HasTrees:
+    """A sampler that has trees, which TorchRL's methods find by their own names."""
+
+    trees: Any
+
+    @property
+    def _sum_tree(self) -> ReadTree:
+        return ReadTree(self.trees, minimum=False)
+
+    @property
+    def _min_tree(self) -> ReadTree:
+        return ReadTree(self.trees, minimum=True)
 
 
 def is_learned(priorities: Tensor) -> Tensor:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Level
-from torchrl_mpfa.checks import check_not_negative
+from torchrl_mpfa.adjustment import Adjustment
+from torchrl_mpfa.checks import Level, check_not_negative
 from torchrl_mpfa.fusion import Fusion, checked_weights
+from torchrl_mpfa.samplers.table import SignalTable
 from torchrl_mpfa.saving import check_saved
-
-if TYPE_CHECKING:
-    from torchrl_mpfa.samplers.fused import SignalSampler
 
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
@@ -24,6 +22,44 @@ _COUNT_REFRESH = 1 / 16
 _ENOUGH = 100
 """With fewer rewards there is no warning that all are on one side."""
 _NO_WEIGHTS = torch.empty(0, device="cpu")
+
+
+class Fusing(Protocol):
+    """What is read of a sampler that fuses signals."""
+
+    @property
+    def table(self) -> SignalTable:
+        """Signals, reward, replay count and time of writing of every slot."""
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weight of each signal at the last count."""
+
+    @property
+    def fusion(self) -> Fusion:
+        """How signals become one priority."""
+
+    @property
+    def adjustments(self) -> Sequence[Adjustment]:
+        """Changes of fused priorities, in order."""
+
+    @property
+    def positive_above(self) -> Level:
+        """Reward above which a transition is positive."""
+
+    @property
+    def recounts(self) -> bool:
+        """True if fusion or adjustments count at each update, or may have to."""
+
+    @property
+    def entropy_refresh(self) -> float:
+        """Share of the buffer that may be rewritten before weights are counted again."""
+
+    def combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
+        """Return priorities by Eq. (21), eps included, shape ``[B]``."""
+
+    def warn_once(self, subject: str, text: str) -> None:
+        """Warn of a subject that this sampler has not yet warned of."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +129,14 @@ def restored_weighing(
     )
 
 
-def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weighing:
+def weigh(sampler: Fusing, index: Tensor, last: Weighing | None) -> Weighing:
     """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
     table, refresh = sampler.table, sampler.entropy_refresh
     weighing = last or Weighing()
     changed = table.writes - weighing.writes
     due = last is None or refresh == 0 or not 0 <= changed <= refresh * table.size
+    if not (due or sampler.recounts):
+        return weighing
     if due or sampler.fusion.every_batch:
         names = table.names[table.fused]
         weighing = replace(weighing, weights=checked_weights(sampler.fusion, names, table, index))
@@ -112,7 +150,7 @@ def weigh(sampler: SignalSampler, index: Tensor, last: Weighing | None) -> Weigh
     return _count(sampler, len(index), weighing)
 
 
-def _count(sampler: SignalSampler, batch_size: int, weighing: Weighing) -> Weighing:
+def _count(sampler: Fusing, batch_size: int, weighing: Weighing) -> Weighing:
     """Have the adjustments count the buffer again, by present weights, if enough of it changed."""
     table = sampler.table
     changed = table.writes - weighing.counted_writes + weighing.learned_since
@@ -131,7 +169,7 @@ def _count(sampler: SignalSampler, batch_size: int, weighing: Weighing) -> Weigh
     )
 
 
-def one_sided(sampler: SignalSampler) -> str | None:
+def one_sided(sampler: Fusing) -> str | None:
     """Return a warning if all rewards of a buffer are on one side of the level of a sampler.
 
     There is none for few rewards, nor for rewards that are all equal, which no level separates.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -20,6 +20,10 @@ _WIDTH = 4
 
 Precision is 4 or 8 where numbers must be finite, and 0 for all else."""
 _NUMBERS = {torch.float: 4, torch.double: 8}
+_FEW = 16
+"""Pages that a batch may wait for before pages are asked for."""
+_LOOK = 16
+"""Batches until it is seen again whether that is needed: asking for what is there takes time."""
 _Path = tuple[str, ...]
 _Tree = dict[str, "_Entry | _Branch"]
 
@@ -61,6 +65,9 @@ class RowPlan:
     ) -> None:
         self._allowed = {as_path(key) for key in allow_nonfinite}
         self._columns: list[int] = []
+        # True while rows are waited for one after the other, as of a file larger than memory.
+        self._is_cold, self._reads = False, 0
+        self._is_mapped = False
         # True if compiled loops read and write all entries.
         self._by_c = ndim == 1 and find_loops() is not None
         self._root = self._describe(stored, ndim, ())
@@ -79,6 +86,7 @@ class RowPlan:
             if not isinstance(value, Tensor):
                 self._by_c = False
                 continue
+            self._is_mapped |= isinstance(value, MemoryMappedTensor)
             number = value.is_floating_point() and (*path, key) not in self._allowed
             place = len(self._columns)
             tree[key] = _Entry(value, value.shape[ndim:], value.dtype, number, place)
@@ -107,9 +115,21 @@ class RowPlan:
         columns = array("q", self._columns)
         slots, count = slots.contiguous(), slots.numel()
         rows = _empty(self._root, count, columns, beside or {})
+        table = columns.buffer_info()[0], len(columns) // _WIDTH
         batch = address(slots, torch.long), count, filled
-        wrong = loops().gather(columns.buffer_info()[0], len(columns) // _WIDTH, *batch)
-        return None if wrong else rows
+        gather = self._gather_mapped if self._is_mapped else loops().gather
+        return None if gather(*table, *batch) else rows
+
+    def _gather_mapped(self, *batch: int) -> int:
+        """Copy rows out of files, whose pages are asked for first if they have to be waited for."""
+        self._reads += 1
+        if self._is_cold and self._reads % _LOOK:
+            loops().ask(*batch)
+            return int(loops().gather(*batch))
+        before = loops().waits()
+        wrong: int = loops().gather(*batch)
+        self._is_cold = loops().waits() - before > _FEW
+        return wrong
 
     @opaque
     def match(self, data: TensorDictBase, *, with_index: bool = True) -> NewRows | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import wandb
+from PIL import Image
 
 import train
 from tests.integration.tiny_runs import OVERRIDES, mostly_slow
@@ -47,7 +48,8 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("drawn_curves")
+def test_a_run_leaves_its_settings_and_how_far_it_is_and_its_curve(tmp_path: Path) -> None:
     assert begin(tmp_path, "seed=4") == 0
     assert json.loads((tmp_path / files.SETTINGS).read_text())["seed"] == 4
     status = json.loads((tmp_path / files.STATUS).read_text())
@@ -57,6 +59,8 @@ def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
         *(files.CHECKPOINT, files.POLICY, files.SETTINGS, files.EPISODES, files.CURVE),
         *(files.STATUS, files.UPDATES, ".lock"),
     }
+    with Image.open(tmp_path / files.CURVE) as picture:
+        assert picture.size[0] > 400
 
 
 @pytest.mark.parametrize("lost", mostly_slow(["save_atomically", "write_table"], ["write_table"]))

@@ -15,14 +15,12 @@ from tests.integration.tiny_runs import (
     blocky,
     go_on,
     mostly_slow,
-    stop_after,
     tiny,
     train,
     weights_of,
 )
 from torchrl_mpfa.selection import SampledBatch
 from training.records import read_table
-from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.updates import COLUMNS, UpdateLog
 
@@ -125,16 +123,6 @@ def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) ->
     assert of_run(tmp_path)["total_steps"].tolist() == list(range(3, 41, 3))
     go_on(tmp_path, settings)
     pd.testing.assert_frame_equal(of_run(tmp_path), of_run(tmp_path / "whole"))
-
-
-def test_a_run_goes_on_whose_checkpoint_is_older_than_the_rows(tmp_path: Path) -> None:
-    settings = tiny()
-    settings.environment.max_steps, settings.tracking.log_every = 25, 5
-    stop_after(40, tmp_path, settings)
-    state = read_checkpoint(tmp_path)
-    del state["log"]
-    train(tmp_path, settings, state=state)
-    assert of_run(tmp_path)["total_steps"].iloc[0] == 45
 
 
 def test_the_share_that_phi_follows_is_in_the_rows(tmp_path: Path) -> None:

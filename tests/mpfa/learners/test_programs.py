@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from tests.mpfa.compiled import UNTRACED, assert_alike, counting, make_pair, update_both
 from tests.mpfa.learning import BOUNDS, make_batch, make_learner, make_networks
@@ -47,6 +48,17 @@ def test_learners_of_equal_settings_share_programs_and_learn_as_alone(name):
     assert_alike(learners[1], alone, rtol=0, atol=0)
 
 
+def test_record_with_examples_of_its_results_is_the_one_that_tests_make_without(monkeypatch):
+    made = []
+    shared = counting(made)
+    first, second = (make_learner(seed=seed, compile=shared) for seed in range(2))
+    update_both([first], 0)
+    needed = len(made)
+    monkeypatch.setattr(program, "make_fx", make_fx)
+    update_both([second], 0)
+    assert len(made) == needed > 0
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -70,7 +82,7 @@ def test_learners_of_other_settings_learn_as_alone(options):
     update_both([first], 0)
     options_again = copy.deepcopy(options)
     second = make_learner(**options, compile=shared)
-    alone = make_learner(**options_again, compile=counting([]))
+    alone = make_learner(**options_again, compile=UNTRACED)
     for seed in range(2):
         update_both([alone, second], seed)
     assert_alike(second, alone, rtol=0, atol=0)

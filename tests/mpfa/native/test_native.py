@@ -1,6 +1,7 @@
 """Compiled loops do what PyTorch does."""
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,9 @@ from torchrl_mpfa import (
     SignalMemmapStorage,
     SignalReplayBuffer,
     SignalTensorStorage,
+    native,
 )
+from torchrl_mpfa.storages import plan
 
 CAPACITY, BATCH = 37, 8
 ONE = torch.ones(1, dtype=torch.double)
@@ -94,7 +97,7 @@ def test_a_number_that_is_not_finite_is_rejected_and_nothing_written(number, dty
     with pytest.raises(ValueError, match="'further' must be finite"):
         buffer.extend(wrong)
     assert buffer.writer._cursor == len(buffer) == 4
-    assert torch.equal(before["_sampler"]["_leaves"], buffer.sampler.state_dict()["_leaves"])
+    assert torch.equal(before["_sampler"]["_sum_tree"], buffer.sampler.state_dict()["_sum_tree"])
 
 
 def test_a_storage_larger_than_its_sampler_samples_no_slot_outside_of_it(monkeypatch):
@@ -148,6 +151,24 @@ def test_several_threads_write_and_sample_one_buffer(monkeypatch):
     for thread in threads:
         thread.join()
     sampler = buffer.sampler
-    leaves = sampler.state_dict()["_leaves"]
+    leaves = sampler.state_dict()["_sum_tree"]
     assert sampler.trees.sum(64) == pytest.approx(float(leaves.sum()), rel=1e-12)
     assert sampler.table.writes == 64 + 3 * 40 * 5
+
+
+def test_pages_of_mapped_rows_are_asked_for_while_they_are_waited_for(monkeypatch):
+    take("compiled", monkeypatch)
+    storage, rows = SignalMemmapStorage(64), make_transitions(64)
+    storage.set(torch.arange(64), rows)
+    slots, asked = torch.tensor([3, 0, 0, 63]), []
+    assert (storage.get(slots) == rows[slots]).all()
+    reading = storage.plan(slots)
+    assert not reading._is_cold  # They are in memory, as they have just been written.
+    loops = native.loops()
+    ask = lambda *batch: asked.append(loops.ask(*batch))  # noqa: E731
+    monkeypatch.setattr(plan, "loops", lambda: SimpleNamespace(**{**vars(loops), "ask": ask}))
+    monkeypatch.setattr(plan, "_FEW", -1)
+    for _ in range(2 * plan._LOOK):
+        assert (storage.get(slots) == rows[slots]).all()
+    # But for the first of them, and for one in so many.
+    assert len(asked) == 2 * plan._LOOK - 3

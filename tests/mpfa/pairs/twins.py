@@ -25,7 +25,8 @@ from tests.mpfa.pairs.parts import (
     make_rows,
 )
 from torchrl_mpfa import SignalReplayBuffer, native
-from torchrl_mpfa.samplers import table, trees
+from torchrl_mpfa.native import tables
+from torchrl_mpfa.samplers import trees
 from torchrl_mpfa.storages import plan
 
 AXES = {
@@ -46,7 +47,7 @@ COPIED = ("pickle", "deepcopy")
 @contextmanager
 def without_c():
     """Have parts take PyTorch in place of the compiled loops."""
-    modules = (native, table, trees, plan)
+    modules = (native, tables, trees, plan)
     before = [module.find_loops for module in modules]
     for module in modules:
         module.find_loops = lambda: None

@@ -1,4 +1,4 @@
-"""Every test of the samplers runs with compiled loops, and with PyTorch in their place."""
+"""What touches trees, rows and tables is tested with compiled loops, and with PyTorch instead."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.mpfa.native.paths import PATHS, take
 from torchrl_mpfa import native
 
 
-@pytest.fixture(autouse=True, params=PATHS)
+@pytest.fixture(params=PATHS)
 def path(request, monkeypatch):
     """What samplers and storages of a test take."""
     take(request.param, monkeypatch)

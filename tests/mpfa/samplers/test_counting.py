@@ -9,6 +9,8 @@ from tests.mpfa.transitions import make_transitions, restore, seeded, set_signal
 from torchrl_mpfa import Adjustment, PositiveBoost, SignalSampler
 from torchrl_mpfa.methods import make_replay
 
+pytestmark = pytest.mark.usefixtures("path")
+
 
 class Census(Adjustment):
     """Counts how often it was asked, and keeps what it was told."""

@@ -9,6 +9,8 @@ from torchrl.data import ReplayBufferEnsemble
 from tests.mpfa.transitions import make_filled, make_transitions, write_signals
 from torchrl_mpfa.samplers.slots import as_slots
 
+pytestmark = pytest.mark.usefixtures("path")
+
 NO_INTEGERS = "index must hold integers, got"
 
 

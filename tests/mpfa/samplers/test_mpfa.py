@@ -27,6 +27,8 @@ from torchrl_mpfa import (
     SignalSampler,
 )
 
+pytestmark = pytest.mark.usefixtures("path")
+
 
 def priorities(buffer):
     """Priorities of all filled slots: eps included, alpha not applied."""

@@ -16,6 +16,8 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.methods import make_replay
 
+pytestmark = pytest.mark.usefixtures("path")
+
 
 def pendulum(count=1200, *, seed=0):
     """Rewards of Pendulum: a cost, hence negative."""

@@ -21,6 +21,8 @@ from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.samplers import TreeSampler
 
+pytestmark = pytest.mark.usefixtures("path")
+
 
 def filled(sampler, count, capacity):
     """A storage with so many rows, marked in the sampler as TorchRL's buffer does."""
@@ -201,6 +203,18 @@ def test_of_a_slot_that_appears_twice_the_last_entry_counts(count):
     assert sampler.priorities().tolist() == expected
     assert sampler.trees.leaves(torch.arange(50)).tolist() == expected
     assert sampler.trees.lowest(50) == min(expected)
+
+
+def test_torchrl_reads_the_trees_by_its_own_names():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
+    sampler.mark_update(torch.arange(3))
+    sampler.update_priority(torch.tensor([1, 2]), torch.tensor([0.5, 3.0]))
+    assert sampler._tree_argmax()[1] == 2
+    assert sampler._sum_tree[[0, 1, 3]].tolist() == [1.0, 0.5, 0.0]
+    assert sampler._min_tree[1] == sampler._min_tree.query(0, 4) == 0.5
+    assert sampler._sum_tree.query(0, 3) == 4.5
+    with pytest.raises(ValueError, match="start must be 0, got 1"):
+        sampler._sum_tree.query(1, 3)
 
 
 def test_slot_of_the_highest_priority_is_that_of_torchrl():

@@ -37,6 +37,7 @@ from torchrl_mpfa import (
 from torchrl_mpfa.signals import MPFA_SIGNALS
 
 ENVS, CAPACITY, LENGTH, ALPHA, BETA = 3, 60, 4, 0.6, 0.4
+BOTH_PATHS = pytest.mark.usefixtures("path")
 READINGS = pytest.mark.parametrize(
     ("slice_priority", "strict_length"),
     [("mean", True), ("mean", False), ("start", True), ("start", False)],
@@ -123,6 +124,7 @@ def check_leaves(buffer):
     return expected
 
 
+@BOTH_PATHS
 @READINGS
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_every_slice_has_the_priority_of_a_plain_loop_after_every_write(
@@ -138,6 +140,7 @@ def test_every_slice_has_the_priority_of_a_plain_loop_after_every_write(
     assert len(buffer) == CAPACITY
 
 
+@BOTH_PATHS
 @READINGS
 def test_no_slice_crosses_the_end_of_a_trajectory_or_the_newest_step(slice_priority, strict_length):
     buffer = filled(slice_priority=slice_priority, strict_length=strict_length, batch_size=40)
@@ -158,6 +161,7 @@ def test_no_slice_crosses_the_end_of_a_trajectory_or_the_newest_step(slice_prior
     assert lengths == ({LENGTH} if strict_length else {1, 2, 3, 4})
 
 
+@BOTH_PATHS
 def test_weights_are_those_of_the_starts_and_of_every_step_of_a_slice():
     buffer = filled()
     priority = slices_by_hand(buffer)
@@ -174,6 +178,7 @@ def test_weights_are_those_of_the_starts_and_of_every_step_of_a_slice():
     assert known.tolist() == sorted(priority)
 
 
+@BOTH_PATHS
 def test_priorities_of_steps_equal_those_without_slices():
     sliced = filled(batch_size=32)
     storage = SignalTensorStorage(CAPACITY, ndim=2)
@@ -189,6 +194,7 @@ def test_priorities_of_steps_equal_those_without_slices():
     check_leaves(sliced)
 
 
+@BOTH_PATHS
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
 @READINGS
 def test_loaded_buffer_of_slices_trains_like_the_saved_one(
@@ -226,6 +232,7 @@ def test_wrong_state_of_slices_is_rejected_and_changes_nothing(name, value, word
         buffer.load_state_dict(state)
 
 
+@BOTH_PATHS
 def test_rounding_never_samples_what_has_the_probability_zero(monkeypatch):
     buffer, steps = make_slices(batch_size=32), make_steps(0, 20)
     steps["next", "done"][:, 0] = True
@@ -244,6 +251,7 @@ def test_rounding_never_samples_what_has_the_probability_zero(monkeypatch):
     assert set(starts.tolist()) <= set(slices_by_hand(buffer))
 
 
+@BOTH_PATHS
 def test_emptied_buffer_has_no_old_slices():
     buffer = filled()
     buffer.empty()
@@ -312,6 +320,7 @@ def test_a_batch_can_leave_the_ends_as_they_were_stored():
     assert batch["next", "done"].equal(stored["next", "done"])
 
 
+@BOTH_PATHS
 @pytest.mark.parametrize("strict_length", [True, False])
 def test_updates_of_an_iteration_learn_from_whole_slices(strict_length):
     sampler = SignalSliceSampler(

@@ -85,6 +85,7 @@ MADE = {
 }
 
 
+@pytest.mark.usefixtures("path")
 @pytest.mark.parametrize("kind", MADE)
 def test_training_samples_the_same_batches_from_leaves_as_from_trees(kind, monkeypatch):
     sampled = []
