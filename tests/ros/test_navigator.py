@@ -249,15 +249,17 @@ def test_it_knows_the_map_of_the_topic_where_localization_has_it(tmp_path: Path,
     rig.aim("odom")
     rig.feed(10.0)
     pilot = rig.navigator.controller.pilot
-    assert pilot.plan is not None and pilot._map is not None and pilot._plan is not None
+    ground = pilot._ground
+    assert pilot.plan is not None and ground.map is not None and ground.plan is not None
     # In the frame of the odometry the wall is at 3 m.
-    origin, levels = pilot._map._memory.arrays.origins[0], pilot._map._memory.arrays.levels[0]
-    column = round((3.05 - pilot._map._center[0] - origin[0]) / 0.1)
+    arrays = ground.map._memory.arrays
+    origin, levels = arrays.origins[0], arrays.levels[0]
+    column = round((3.05 - ground.map._center[0] - origin[0]) / 0.1)
     blocked = (levels[column, 10:50] == 3).mean()
     assert blocked == 1.0 if wall == 100 else blocked < 0.3
     rig.transform = transform(10.2, x=1.5)
     rig.feed(10.2)
-    assert pilot._plan.pose == pytest.approx((-0.5, -3.0, 0.0))
+    assert ground.plan.pose == pytest.approx((-0.5, -3.0, 0.0))
 
 
 @pytest.mark.parametrize(

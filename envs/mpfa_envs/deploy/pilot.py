@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_not_negative, check_number, check_positive
+from mpfa_envs.checks import check_not_negative, check_number
 from mpfa_envs.deploy.adaptation import (
     body_of,
     cannot_turn,
@@ -19,8 +19,9 @@ from mpfa_envs.deploy.adaptation import (
     tolerance,
 )
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
+from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
-from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
+from mpfa_envs.deploy.map_path import pair_of
 from mpfa_envs.robots.drives import Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.scan import Scan
@@ -115,21 +116,12 @@ class Pilot:
             card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
         )
         self._network = network
-        side = check_positive("map_size", map_size)
-        self._map_size = side if card.memory == "map" else None
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
-        self._map: MapPath | None = None
-        if card.memory == "map":
-            # Its loops are compiled before the first decision is due.
-            self._map = MapPath(card)
+        self._ground = Ground(card, map_size)
         self._body = body_of(card.robot, self.robot, self.pace)
         self._keep = filter_of(card, self.robot, self._body, clearance)
-        self._goal: tuple[float, float] | None = None
-        self._center: tuple[float, float] | None = None
-        self._plan: Plan | None = None
-        self._fresh_map, self._fresh = False, True
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -183,12 +175,13 @@ class Pilot:
     @property
     def goal(self) -> tuple[float, float] | None:
         """The goal (x, y) [m]; None without."""
-        return self._goal
+        return self._ground.goal
 
     @property
     def plan(self) -> World | None:
         """The building that :meth:`begin` was given; None without, and without a goal."""
-        return None if self._plan is None or self._goal is None else self._plan.world
+        plan = self._ground.plan
+        return None if plan is None or self.goal is None else plan.world
 
     @property
     def turns_on_the_spot(self) -> bool:
@@ -223,20 +216,13 @@ class Pilot:
                 on the spot.
         """
         self._arrival.check(heading)
-        center = None if map_center is None else pair_of("map_center", map_center)
-        goal = pair_of("goal", goal)
-        ground = None if plan is None else plan_at(plan, plan_pose)
-        if ground is not None:
-            ground.check(has_map=self._map is not None, center=center)
-            center = ground.middle
-        check_on_map(goal, center, ground, self._map_size)
+        self._ground.begin(goal, map_center, plan, plan_pose)
         self._arrival.begin(heading)
-        self._goal, self._center, self._plan, self._fresh = goal, center, ground, True
         self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
         """Give up the goal."""
-        self._goal = None
+        self._ground.goal = None
 
     def move_goal(self, goal: tuple[float, float], *, heading: float | None = None) -> None:
         """Correct the goal while driving; the map is kept.
@@ -249,15 +235,11 @@ class Pilot:
             ValueError: If it is not finite, beyond 1e7 m or not on the map, or the robot has not
                 set out.
         """
-        if self._goal is None:
+        if self.goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
         if heading is not None and self._arrival.heading is not None:
             self._arrival.heading = check_number("heading", heading)
-        if (goal := pair_of("goal", goal)) != self._goal:
-            check_on_map(goal, self._center, self._plan, self._map_size)
-            self._goal = goal
-            if self._map is not None:
-                self._map.look_again()
+        self._ground.move_goal(goal)
 
     def move_plan(self, pose: tuple[float, float, float]) -> None:
         """Correct the pose of the plan while driving, as localization does.
@@ -270,26 +252,19 @@ class Pilot:
         Raises:
             ValueError: If a number is not finite or too large, or there is no plan.
         """
-        if self._plan is None:
-            raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
-        moved = plan_at(self._plan.world, pose)
-        if self._plan.is_off(moved.pose):
-            self._plan, self._center, self._fresh_map = moved, moved.middle, True
+        self._ground.move_plan(pose)
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
         """Return True if a pose is at the goal, with the heading that :meth:`begin` was given."""
-        if self._goal is None:
-            return False
-        return self._arrival.is_at(pose, math.dist(pose[:2], self._goal))
+        goal = self.goal
+        return goal is not None and self._arrival.is_at(pose, math.dist(pose[:2], goal))
 
     def closed_in(self, place: tuple[float, float]) -> bool:
         """Return True if all paths from a place (x, y) to the goal cross walls that are known.
 
         Unseen places count as free. Without a map nothing is known.
         """
-        if self._map is None or self._goal is None or self._fresh or self._fresh_map:
-            return False
-        return self._map.closes_in(self._goal, self.goal_radius, place)
+        return self._ground.closes_in(self.goal_radius, place)
 
     def observe(
         self,
@@ -332,7 +307,7 @@ class Pilot:
         age: float,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
         """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
-        if self._goal is None:
+        if self.goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
         pair_of("pose", (x, y))
@@ -344,22 +319,13 @@ class Pilot:
         )
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
-        card = self.card
-        center = self._center or (x, y)
-        check_on_map(self._goal, center, self._plan, self._map_size)
+        self._ground.check_at((x, y))
         ranges, points = self.sectors.read(scan)
-        path = np.zeros((0, 3))
-        if self._map is not None:
-            if self._fresh or self._fresh_map:
-                self._map.begin(center, sides_of(self._plan, self._map_size), self._plan)
-                self._center, self._fresh_map = center, False
-                if self._fresh and self._plan is not None:
-                    self._map.reject_closed(self._goal, self.goal_radius, (x, y))
-            path = self._map.sense(ahead[0], taken, self._goal, points)
-        facts = self._goal, self._fresh, path, self.pace
-        rows = observations_from(ahead, ranges, points, taken, card, self._observation, *facts)
+        path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
+        facts = self.goal, self._ground.is_new, path, self.pace
+        rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
-        self._fresh = False
+        self._ground.is_new = False
         return rows[0], rows, float(ahead[0, 2] - taken[2])
 
     def give(self, time: float, linear: float, angular: float) -> None:
@@ -395,7 +361,7 @@ class Pilot:
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
         observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        slower = math.inf if self._goal is None else self._arrival.fastest(pose, self._goal)
+        slower = math.inf if self.goal is None else self._arrival.fastest(pose, self.goal)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
