@@ -14,6 +14,7 @@ import yaml
 pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
 
 import mpfa_envs
+from mpfa_envs import load_policy
 from mpfa_envs.deploy import Pilot
 from mpfa_envs.ros.controller import Controller
 from tests.envs.exported import card
@@ -63,10 +64,21 @@ def test_each_robot_has_a_launch_file(file: Path) -> None:
     assert f"$(dirname)/{file.name}" in text
 
 
-def test_a_prefix_has_what_ros2_run_and_ros2_launch_look_for() -> None:
+def test_the_simulated_robot_is_that_of_the_policies_for_rooms() -> None:
+    root = ElementTree.parse(FOLDER / "launch" / "simulated.launch.xml").getroot()
+    defaults = {each.get("name"): each.get("default") for each in root.iter("arg")}
+    assert defaults["robot"] == load_policy("td3-rooms").env_arguments["robot"]["name"]
+
+
+def places_in_a_prefix() -> dict[str, Path]:
+    """Where in a prefix the wheel puts which file or folder for ROS 2."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[tool.hatch.build.targets.wheel.shared-data]")[2].partition("\n\n")[0]
-    places = {there: ROOT / here for here, there in re.findall(r'"(.+)" = "(.+)"', section)}
+    return {there: ROOT / here for here, there in re.findall(r'"(.+)" = "(.+)"', section)}
+
+
+def test_a_prefix_has_what_ros2_run_and_ros2_launch_look_for() -> None:
+    places = places_in_a_prefix()
     assert set(places) == {
         "share/ament_index/resource_index/packages/mpfa_envs",
         "share/mpfa_envs/package.xml",

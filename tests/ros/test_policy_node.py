@@ -6,6 +6,7 @@ import json
 import math
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.ros import policy_node
 from mpfa_envs.ros.policy_node import PolicyNode
 from tests.ros.live import Live, live, parameter
+from tests.ros.processes import node
 from tests.ros.test_navigator import straight, turning
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -256,12 +258,22 @@ def test_a_check_that_fails_stops_the_robot_and_is_said(
     assert started.until(lambda: around.sent[-1][0] > 0.1)
 
 
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Those of signals are afterwards what they were."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {number: signal.getsignal(number) for number in numbers}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ["SIGINT", "SIGTERM", "SIGHUP", "error"])
 def test_it_stops_the_robot_at_its_end(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, end: str
 ) -> None:
-    handlers = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)}
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     sent: list[tuple[float, float]] = []
 
     def spin(node: Any) -> None:
@@ -279,13 +291,35 @@ def test_it_stops_the_robot_at_its_end(
     monkeypatch.setattr(
         PolicyNode, "start", lambda node: (node.set_parameters([policy]), start(node))
     )
-    try:
-        if end == "error":
-            with pytest.raises(RuntimeError, match="a bad message"):
-                policy_node.main()
-        else:
+    if end == "error":
+        with pytest.raises(RuntimeError, match="a bad message"):
             policy_node.main()
-    finally:
-        for name, handler in handlers.items():
-            signal.signal(name, handler)
+    else:
+        policy_node.main()
     assert sent[-1] == (0.0, 0.0)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_signal_that_a_callback_of_the_compiler_hides_ends_it_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def start(_: PolicyNode) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    def spin(_: PolicyNode) -> None:
+        raise AssertionError("the node runs")
+
+    monkeypatch.setattr(PolicyNode, "start", start)
+    monkeypatch.setattr(rclpy, "spin", spin)
+    policy_node.main()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_node_that_no_one_has_configured(number: signal.Signals) -> None:
+    with live(None) as found, node("policy_node", autostart=False) as process:
+        client = found.around.node.create_client(GetState, "mpfa_policy/get_state")
+        assert found.until(client.service_is_ready, 60.0)
+        found.until(lambda: False, 0.5)
+        process.send_signal(number)
+        assert process.wait(10.0) == 0

@@ -68,6 +68,8 @@ class PolicyNode(LifecycleNode):
         # A clock of a simulator may stop, and with it all that counts its time.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ticked, self._ticked_at, self._frozen = 0, 0, ""
+        # Also before it is configured: a node that nothing wakes does not hear a signal.
+        self.create_timer(_WATCH, self._watch, clock=self._steady)
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
@@ -137,8 +139,7 @@ class PolicyNode(LifecycleNode):
         service = self.create_service(Trigger, "~/cancel", self._on_cancel)
         self._undo.append(partial(self.destroy_service, service))
         checks = self.create_timer(1.0 / value("rate"), self._tick)
-        watch = self.create_timer(_WATCH, self._watch, clock=self._steady)
-        self._undo += [partial(self.destroy_timer, timer) for timer in (checks, watch)]
+        self._undo.append(partial(self.destroy_timer, checks))
         self._serve_action()
 
     def _publish_on(self, kind: Any, topic: str, quality: Any) -> Any:
@@ -327,20 +328,35 @@ class PolicyNode(LifecycleNode):
         self.trigger_activate()
 
 
+def end_on_signals() -> list[int]:
+    """Have signals end the program; the list holds those that came."""
+    came: list[int] = []
+
+    def end(number: int, _: Any) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    hangup = getattr(signal, "SIGHUP", None)
+    # A user who ignores the signal wants the node to outlive the terminal.
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signal.signal(hangup, end)
+    return came
+
+
 def main() -> None:
     """Run the node until it is shut down."""
     # The signal handlers of rclpy would end all publishing before the robot is stopped.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    hangup = getattr(signal, "SIGHUP", None)
-    # A user who ignores the signal wants the node to outlive the terminal.
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
-        signal.signal(hangup, signal.default_int_handler)
+    came = end_on_signals()
     node = PolicyNode()
     try:
         if node.get_parameter("autostart").value:
             node.start()
-        rclpy.spin(node)
+        # The compiler of the loops calls back, and hides what a signal raises then.
+        if not came:
+            rclpy.spin(node)
     except KeyboardInterrupt:
         pass
     finally:
