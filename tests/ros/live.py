@@ -122,6 +122,17 @@ class Live:
             self.executor.spin_once(timeout_sec=0.02)
         return bool(holds())
 
+    def stands_after(self, moment: float) -> float:
+        """Time from a moment [s] to the first order to stand after it [s]; waits for that."""
+        around = self.around
+
+        def first() -> float | None:
+            orders = zip(around.times, around.sent, strict=True)
+            return next((t for t, speeds in orders if t > moment and speeds == (0.0, 0.0)), None)
+
+        assert self.until(lambda: first() is not None)
+        return (first() or math.inf) - moment
+
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service."""
         client = self.around.node.create_client(kind, name)

@@ -19,6 +19,9 @@ from std_msgs.msg import Bool
 from mpfa_envs import Task
 from mpfa_envs.ros.messages import odometry_of, seconds, write_pose
 
+SECONDS = "seconds until the robot stands or is ordered to"
+"""A property of tests of faults."""
+
 
 @contextmanager
 def node(module: str, **parameters: Any) -> Iterator[subprocess.Popen[bytes]]:

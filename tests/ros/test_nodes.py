@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed: the nodes were not run (extra ros)")
+pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11 on Linux): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import rclpy
@@ -20,7 +21,7 @@ from sensor_msgs.msg import LaserScan
 from mpfa_envs import evaluate, export_policy, load_policy, world_tasks
 from tests.envs.exported import SHIPPED
 from tests.ros.live import choose_domain
-from tests.ros.processes import Bench, node
+from tests.ros.processes import SECONDS, Bench, node
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 _SPEED = 3.0
@@ -42,7 +43,9 @@ def policy(tmp_path: Path) -> Path:
     return export_policy(load_policy(SHIPPED), tmp_path / "policy.onnx")
 
 
-def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path) -> None:
+def test_the_node_stops_on_stale_scans_and_at_its_end(
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
+) -> None:
     scans = bench.node.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
     odometry = bench.node.create_publisher(Odometry, "odom", 10)
     sees = True
@@ -65,8 +68,9 @@ def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path
         bench.until(lambda: False, 1.0)
         bench.send(bench.goal, (3.0, 0.0, 0.0))
         assert bench.until(lambda: bool(bench.commands) and bench.commands[-1][0] > 0.05, 20.0)
-        sees = False
+        sees, ended = False, time.monotonic()
         assert bench.until(lambda: bench.commands[-1] == (0.0, 0.0), 20.0)
+        record_property(SECONDS, time.monotonic() - ended)
         sees = True
         assert bench.until(lambda: bench.commands[-1][0] > 0.05, 20.0)
         bench.send(bench.goal, (math.nan, 0.0, 0.0))
@@ -95,7 +99,9 @@ def test_twenty_drives_in_real_processes_succeed_as_in_the_environment(
     assert sum(reached) >= sum(result.success for result in want) - 1
 
 
-def test_the_robot_stops_by_itself_when_the_node_is_killed(bench: Bench, policy: Path) -> None:
+def test_the_robot_stops_by_itself_when_the_node_is_killed(
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
+) -> None:
     with (
         node("robot_node", world="test"),
         node("policy_node", policy=policy, stop_distance=0.0, use_sim_time=True) as process,
@@ -106,6 +112,7 @@ def test_the_robot_stops_by_itself_when_the_node_is_killed(bench: Bench, policy:
         # The node cannot say anything any more: the base's own timeout of 0.5 s has to stop it.
         killed = bench.now
         assert bench.until(lambda: abs(bench.speeds[0]) < 0.01, 20.0)
+        record_property(SECONDS, bench.now - killed)
         assert bench.now - killed < 2.0
         place = bench.pose
         bench.until(lambda: bench.now > killed + 3.0, 20.0)
@@ -113,7 +120,7 @@ def test_the_robot_stops_by_itself_when_the_node_is_killed(bench: Bench, policy:
 
 
 def test_the_node_stops_when_the_simulation_with_its_clock_is_killed(
-    bench: Bench, policy: Path
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
 ) -> None:
     with (
         node("robot_node", world="test") as robot,
@@ -121,7 +128,9 @@ def test_the_node_stops_when_the_simulation_with_its_clock_is_killed(
     ):
         begin(bench)
         robot.kill()
+        killed = time.monotonic()
         assert bench.until(lambda: bench.commands[-1] == (0.0, 0.0), 20.0)
+        record_property(SECONDS, time.monotonic() - killed)
         assert bench.until(lambda: bench.status["state"] == "waiting", 20.0)
         assert bench.until(lambda: bench.status["reason"].startswith("the clock"), 20.0)
         with node("robot_node", world="test"):
