@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11 on Linux): the nodes were not run")
+pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 pytest.importorskip("ros2launch", reason="ros2 run and ros2 launch are not in the Python index")
 

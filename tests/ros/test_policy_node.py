@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11 on Linux): the nodes were not run")
+pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import rclpy
