@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import time
@@ -115,7 +116,7 @@ class Live:
         for node in filter(None, (self.around.node, self.node)):
             self.executor.add_node(node)
 
-    def until(self, holds: Callable[[], Any], timeout: float = 20.0) -> bool:
+    def until(self, holds: Callable[[], Any], timeout: float = 60.0) -> bool:
         """Wait until something holds, or for so many seconds."""
         end = time.monotonic() + timeout
         while not holds() and time.monotonic() < end:
@@ -158,6 +159,9 @@ def live(make: Callable[..., Any] | None, **parameters: Any) -> Iterator[Live]:
             made.node.destroy_node()
         made.around.node.destroy_node()
         rclpy.shutdown()
+        # The services of a life cycle are on the network until their node is collected.
+        made.node = None
+        gc.collect()
 
 
 def parameter(name: str, value: Any) -> Any:

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
@@ -44,6 +45,8 @@ _WATCH: Final = 0.1
 """Time from one look at the clock to the next [s]."""
 _FROZEN: Final = 0.5
 """Time for which the clock may stand still while the robot drives [s]."""
+_ACKNOWLEDGED: Final = 0.5
+"""Longest time that the node waits at its end for those who have not yet got its last order [s]."""
 _LATCHED: Final = {"depth": 1, "durability": DurabilityPolicy.TRANSIENT_LOCAL}
 
 
@@ -62,6 +65,7 @@ class PolicyNode(LifecycleNode):
         self.navigator: Navigator | None = None
         """None unless the node is configured."""
         self._action: NavigateAction | None = None
+        self._commands: Any = None
         self._undo: list[Callable[[], Any]] = []
         self._goals, self._reason, self._told_at = 0, "", -1.0
         self._kind: tuple[Any, ...] = ()
@@ -180,9 +184,10 @@ class PolicyNode(LifecycleNode):
         return lambda target, source: buffer.lookup_transform(target, source, Time())
 
     def _clean_up(self) -> None:
+        self.wait_for_listeners()
         while self._undo:
             self._undo.pop()()
-        self.navigator = self._action = None
+        self.navigator = self._action = self._commands = None
         self._listener = None
 
     def _now(self) -> float:
@@ -320,6 +325,11 @@ class PolicyNode(LifecycleNode):
         if self.navigator is not None:
             self._publish(0.0, 0.0)
 
+    def wait_for_listeners(self) -> None:
+        """Wait until the last order has arrived; it may be lost with its publisher."""
+        if self._commands is not None:
+            self._commands.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
+
     def start(self) -> None:
         """Configure and activate the node, as a manager of life cycles does."""
         self.trigger_configure()
@@ -360,9 +370,13 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     finally:
+        # A second one, as from a terminal and from a launcher, must not come between.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         # If this fails nothing can be published, and the first error must be seen.
         with suppress(Exception):
             node.stop()
+            node.wait_for_listeners()
         node.destroy_node()
         rclpy.try_shutdown()
 
