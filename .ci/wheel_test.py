@@ -21,6 +21,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("torchrl_mpfa", "mpfa_envs")
+# What `ros2 run` and `ros2 launch` find a package by, in a prefix.
+FOR_ROS = (
+    "share/ament_index/resource_index/packages/mpfa_envs",
+    "share/mpfa_envs/package.xml",
+    "share/mpfa_envs/launch/turtlebot4.launch.xml",
+    "lib/mpfa_envs/policy_node",
+    "lib/mpfa_envs/robot_node",
+)
 
 USE = """
 import importlib.metadata
@@ -127,7 +135,7 @@ def check_contents(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     tops = {name.split("/")[0] for name in names}
-    strangers = {t for t in tops if t not in PACKAGES and not t.endswith(".dist-info")}
+    strangers = {t for t in tops if t not in PACKAGES and not t.endswith((".dist-info", ".data"))}
     if strangers:
         raise SystemExit(f"the wheel has more than the packages: {sorted(strangers)}")
     for package, source in zip(PACKAGES, (ROOT, ROOT / "envs"), strict=True):
@@ -137,6 +145,9 @@ def check_contents(wheel: Path) -> None:
         } - names
         if missing:
             raise SystemExit(f"the wheel lacks {sorted(missing)}")
+    prefix = {name.partition(".data/data/")[2] for name in names}
+    if lacking := set(FOR_ROS) - prefix:
+        raise SystemExit(f"the wheel lacks {sorted(lacking)} for ROS 2")
     if not any(re.fullmatch(r"mpfa_envs/assets/.+\.yaml", name) for name in names):
         raise SystemExit("the wheel lacks the worlds in mpfa_envs/assets")
     print(f"{len(names)} files, of {', '.join(sorted(tops))}", flush=True)

@@ -146,7 +146,18 @@ def test_the_replay_parts_import_torch_and_torchrl_and_little_else():
     assert {name: more for name, more in found.items() if more} == {}
 
 
-MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_ros"}
+MESSAGES = {
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "nav2_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+    "rosgraph_msgs",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+    "tf2_ros",
+}
 
 
 @pytest.mark.parametrize(
@@ -163,7 +174,12 @@ MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_ms
         ),
         (
             {"rclpy", *MESSAGES},
-            {"envs/mpfa_envs/ros/policy_node.py", "envs/mpfa_envs/ros/robot_node.py"},
+            {
+                "envs/mpfa_envs/ros/navigate_action.py",
+                "envs/mpfa_envs/ros/policy_node.py",
+                "envs/mpfa_envs/ros/robot_node.py",
+                "envs/mpfa_envs/ros/status.py",
+            },
         ),
     ],
 )

@@ -115,9 +115,9 @@ def test_a_plan_moves_with_the_localization_and_bounds_the_goal() -> None:
         pilot.move_plan((0.0, 0.0, 0.0))
     pilot.begin((5.0, 0.0), plan=plan)
     pilot.move_plan((0.05, 0.0, 0.0))
-    assert pilot._plan is not None and pilot._plan.pose == (0.0, 0.0, 0.0)
+    assert pilot._ground.plan is not None and pilot._ground.plan.pose == (0.0, 0.0, 0.0)
     pilot.move_plan((0.3, 0.0, 0.0))
-    assert pilot._plan.pose == (0.3, 0.0, 0.0)
+    assert pilot._ground.plan.pose == (0.3, 0.0, 0.0)
     with pytest.raises(ValueError, match="plan must be a World, got 'plan"):
         pilot.begin((5.0, 0.0), plan="plan.yaml")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="plan must be None for a policy without a map"):

@@ -216,8 +216,8 @@ def test_a_late_scan_enters_the_map_where_it_was_taken(late: float) -> None:
         card(memory="map", observation_size=27), lambda seen: np.zeros((1, 2), np.float32)
     )
     entered = []
-    assert pilot._map is not None
-    sense = pilot._map.sense
+    assert pilot._ground.map is not None
+    sense = pilot._ground.map.sense
 
     def noting(pose: Any, taken: Any, goal: Any, points: Any) -> np.ndarray:
         angles = points.angles + taken[2]
@@ -226,7 +226,7 @@ def test_a_late_scan_enters_the_map_where_it_was_taken(late: float) -> None:
         entered.append((x, taken[1] + points.ranges[nearest] * math.sin(angles[nearest])))
         return sense(pose, taken, goal, points)
 
-    pilot._map.sense = noting
+    pilot._ground.map.sense = noting
     controller = Controller(pilot)
     controller.aim((9.0, 0.0))
     # It turns to the left at 2 rad/s, over the direction in which headings begin again.

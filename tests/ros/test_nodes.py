@@ -3,104 +3,34 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed: the nodes were not run")
+pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import rclpy
-from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
-from std_msgs.msg import Bool
 
-from mpfa_envs import Task, evaluate, export_policy, load_policy, world_tasks
-from mpfa_envs.ros.messages import odometry_of, seconds, write_pose
+from mpfa_envs import evaluate, export_policy, load_policy, world_tasks
 from tests.envs.exported import SHIPPED
+from tests.ros.live import choose_domain
+from tests.ros.processes import SECONDS, Bench, node
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 _SPEED = 3.0
 """Of the simulated robot, over real time."""
 
 
-@contextmanager
-def node(module: str, **parameters: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """A node of the package in a process of its own."""
-    words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-    command = [sys.executable, "-m", f"mpfa_envs.ros.{module}", "--ros-args", *words]
-    process = subprocess.Popen(command)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-class Bench:
-    """What stands around the nodes: it hears all topics."""
-
-    def __init__(self) -> None:
-        self.node = rclpy.create_node("bench")
-        self.pose, self.speeds, self.now, self.touched = (0.0, 0.0, 0.0), (0.0, 0.0), 0.0, False
-        self.commands: list[tuple[float, float]] = []
-        self.goal = self.node.create_publisher(PoseStamped, "goal_pose", 1)
-        self.start = self.node.create_publisher(PoseStamped, "start_pose", 1)
-        hear = self.node.create_subscription
-        hear(Odometry, "odom", self._on_odometry, 10)
-        hear(Bool, "contact", self._on_contact, 10)
-        hear(Twist, "cmd_vel", self._on_command, 10)
-
-    def _on_odometry(self, message: Any) -> None:
-        self.pose, self.speeds = odometry_of(message)
-        self.now = seconds(message.header.stamp)
-
-    def _on_contact(self, message: Any) -> None:
-        self.touched = message.data
-
-    def _on_command(self, message: Any) -> None:
-        self.commands.append((message.linear.x, message.angular.z))
-
-    def until(self, holds: Callable[[], bool], timeout: float) -> bool:
-        """Wait until something holds, or for so many seconds."""
-        end = time.monotonic() + timeout
-        while not holds() and time.monotonic() < end:
-            rclpy.spin_once(self.node, timeout_sec=0.05)
-        return holds()
-
-    def drive(self, task: Task) -> bool:
-        """Have the robot drive a task; whether it reached the goal and nothing else."""
-        self.send(self.start, task.start)
-        assert self.until(lambda: math.dist(self.pose[:2], task.start[:2]) < 0.01, 20.0)
-        self.touched, end = False, self.now + 50.0
-        self.send(self.goal, (*task.goal, 0.0))
-
-        def near() -> bool:
-            return math.dist(self.pose[:2], task.goal) <= 0.5
-
-        self.until(lambda: near() or self.touched or self.now > end, 120.0)
-        return near() and not self.touched
-
-    def send(self, publisher: Any, pose: tuple[float, float, float]) -> None:
-        message = PoseStamped()
-        message.header.frame_id = "odom"
-        write_pose(message.pose, pose)
-        publisher.publish(message)
-
-
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    choose_domain()
     rclpy.init()
     found = Bench()
     yield found
@@ -113,7 +43,9 @@ def policy(tmp_path: Path) -> Path:
     return export_policy(load_policy(SHIPPED), tmp_path / "policy.onnx")
 
 
-def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path) -> None:
+def test_the_node_stops_on_stale_scans_and_at_its_end(
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
+) -> None:
     scans = bench.node.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
     odometry = bench.node.create_publisher(Odometry, "odom", 10)
     sees = True
@@ -136,8 +68,9 @@ def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path
         bench.until(lambda: False, 1.0)
         bench.send(bench.goal, (3.0, 0.0, 0.0))
         assert bench.until(lambda: bool(bench.commands) and bench.commands[-1][0] > 0.05, 20.0)
-        sees = False
+        sees, ended = False, time.monotonic()
         assert bench.until(lambda: bench.commands[-1] == (0.0, 0.0), 20.0)
+        record_property(SECONDS, time.monotonic() - ended)
         sees = True
         assert bench.until(lambda: bench.commands[-1][0] > 0.05, 20.0)
         bench.send(bench.goal, (math.nan, 0.0, 0.0))
@@ -164,3 +97,53 @@ def test_twenty_drives_in_real_processes_succeed_as_in_the_environment(
         for each in world_tasks("test", episodes=20, seed=0):
             reached.append(bench.drive(each.task))
     assert sum(reached) >= sum(result.success for result in want) - 1
+
+
+def test_the_robot_stops_by_itself_when_the_node_is_killed(
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
+) -> None:
+    with (
+        node("robot_node", world="test"),
+        node("policy_node", policy=policy, stop_distance=0.0, use_sim_time=True) as process,
+    ):
+        begin(bench)
+        process.kill()
+        assert process.wait(20.0) == -signal.SIGKILL
+        # The node cannot say anything any more: the base's own timeout of 0.5 s has to stop it.
+        killed = bench.now
+        assert bench.until(lambda: abs(bench.speeds[0]) < 0.01, 20.0)
+        record_property(SECONDS, bench.now - killed)
+        assert bench.now - killed < 2.0
+        place = bench.pose
+        bench.until(lambda: bench.now > killed + 3.0, 20.0)
+        assert math.dist(bench.pose[:2], place[:2]) < 0.02
+
+
+def test_the_node_stops_when_the_simulation_with_its_clock_is_killed(
+    bench: Bench, policy: Path, record_property: Callable[[str, object], None]
+) -> None:
+    with (
+        node("robot_node", world="test") as robot,
+        node("policy_node", policy=policy, stop_distance=0.0, use_sim_time=True),
+    ):
+        begin(bench)
+        robot.kill()
+        killed = time.monotonic()
+        assert bench.until(lambda: bench.commands[-1] == (0.0, 0.0), 20.0)
+        record_property(SECONDS, time.monotonic() - killed)
+        assert bench.until(lambda: bench.status["state"] == "waiting", 20.0)
+        assert bench.until(lambda: bench.status["reason"].startswith("the clock"), 20.0)
+        with node("robot_node", world="test"):
+            # Its clock begins again, and its odometry is far from where the robot was.
+            assert bench.until(lambda: bench.status["state"] in ("given up", "driving"), 60.0)
+
+
+def begin(bench: Bench) -> None:
+    """Have the robot drive in the first task of the test world."""
+    for publisher in (bench.goal, bench.start):
+        assert bench.until(lambda p=publisher: p.get_subscription_count() > 0, 60.0)
+    task = world_tasks("test", episodes=1, seed=0)[0].task
+    bench.send(bench.start, task.start)
+    assert bench.until(lambda: math.dist(bench.pose[:2], task.start[:2]) < 0.01, 20.0)
+    bench.send(bench.goal, (*task.goal, 0.0), bench.now)
+    assert bench.until(lambda: bench.speeds[0] > 0.2, 30.0)

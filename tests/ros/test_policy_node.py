@@ -1,4 +1,4 @@
-"""The policy's node on fakes of rclpy and tf2: what it makes of messages, failures and its end."""
+"""The policy's node on real rclpy: its life cycle, status, action, parameters and its end."""
 
 from __future__ import annotations
 
@@ -6,98 +6,202 @@ import json
 import math
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
+pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-from mpfa_envs import Policy, export_policy, load_policy
-from mpfa_envs.policies.layers import Linear
+import rclpy
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+from mpfa_envs import export_policy, load_policy
 from mpfa_envs.robots.model import ROBOTS
-from tests.envs.exported import ENV_ARGUMENTS
-from tests.ros.fake_rclpy import World, install
+from mpfa_envs.ros import policy_node
+from mpfa_envs.ros.policy_node import PolicyNode
+from tests.ros.live import Live, live, parameter
+from tests.ros.processes import node
+from tests.ros.test_navigator import straight, turning
 
-names = SimpleNamespace
-DRIVES, STANDS = (0.5, 0.0), (0.0, 0.0)
+pytestmark = pytest.mark.filterwarnings("ignore")
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+
+
+class MetersAhead:
+    """An action whose goal is a number of meters, in the place of NavigateToPose."""
+
+    kind = Fibonacci
+
+    def place(self, goal: Any) -> Any:
+        message = policy_node.PoseStamped()
+        message.header.frame_id = "odom"
+        message.pose.position.x, message.pose.orientation.w = float(goal.order), 1.0
+        return message
+
+    def feedback(self, progress: Any) -> Any:
+        return Fibonacci.Feedback(sequence=[round(progress.distance), progress.recoveries])
+
+    def result(self, status: Any) -> Any:
+        return Fibonacci.Result(sequence=[len(status.reason)])
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> World:
-    """With a policy that drives straight ahead."""
-    layer = Linear(np.zeros((2, 24), np.float32), np.ones(2, np.float32))
-    policy = Policy([layer], env_arguments=ENV_ARGUMENTS)
-    found = World()
-    found.parameters["policy"] = str(export_policy(policy, tmp_path / "policy.onnx"))
-    return found
+def started(tmp_path: Path) -> Iterator[Live]:
+    """A node that is active."""
+    with live(lambda: PolicyNode(MetersAhead), policy=straight(tmp_path)) as found:
+        found.node.start()
+        assert found.until(lambda: found.around.goals.get_subscription_count() > 0)
+        assert found.until(lambda: found.node.navigator.frames.odometry is not None)
+        yield found
 
 
-@pytest.fixture
-def module(world: World, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    handlers = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)}
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield install(monkeypatch, world)
-    for name, handler in handlers.items():
-        signal.signal(name, handler)
+def test_a_drive_is_accepted_driven_and_arrives_and_the_robot_stands(started: Live) -> None:
+    around = started.around
+    assert started.until(lambda: around.states == ["idle"])
+    around.aim(1.5)
+    assert started.until(lambda: around.states[-1] == "arrived")
+    assert set(around.states[1:-1]) <= {"waiting", "accepted", "driving"}
+    assert "driving" in around.states and around.statuses[-1]["code"] == str(SUCCEEDED)
+    assert around.statuses[-1]["reason"] == "arrived" and around.statuses[-1]["goal"] == "1"
+    assert started.until(lambda: around.sent[-1] == (0.0, 0.0))
+    distances = [distance for distance, _, _ in around.feedbacks if not math.isnan(distance)]
+    assert len(distances) >= 2 and distances == sorted(distances, reverse=True)
+    sent = len(around.sent)
+    started.until(lambda: False, 0.5)
+    assert len(around.sent) == sent
 
 
-def stamp(time: float) -> Any:
-    return names(sec=int(time), nanosec=round((time - int(time)) * 1e9))
+def test_the_status_is_there_for_who_comes_late(started: Live) -> None:
+    started.around.aim(math.nan)
+    assert started.until(lambda: started.around.states[-1] == "rejected")
+    assert started.around.statuses[-1]["reason"].startswith("goal must be a finite number")
+    assert started.around.sent[-1] == (0.0, 0.0)
+    other = type(started.around)()
+    started.executor.add_node(other.node)
+    assert started.until(lambda: other.states == ["rejected"])
+    other.node.destroy_node()
 
 
-def odometry(time: float, x: float = 0.0, frame: str = "odom") -> Any:
-    pose = names(position=names(x=x, y=0.0), orientation=names(x=0.0, y=0.0, z=0.0, w=1.0))
-    twist = names(linear=names(x=0.5), angular=names(z=0.0))
-    header = names(stamp=stamp(time), frame_id=frame)
-    return names(header=header, pose=names(pose=pose), twist=names(twist=twist))
+def test_the_service_cancels_and_says_where_there_is_nothing_to_cancel(started: Live) -> None:
+    around = started.around
+    assert not started.call(Trigger, "mpfa_policy/cancel", Trigger.Request()).success
+    around.aim(5.0)
+    assert started.until(lambda: around.sent and around.sent[-1][0] > 0.1)
+    assert started.call(Trigger, "mpfa_policy/cancel", Trigger.Request()).success
+    assert started.until(lambda: around.states[-1] == "canceled" and around.sent[-1] == (0.0, 0.0))
+    sent = len(around.sent)
+    started.until(lambda: False, 0.5)
+    assert len(around.sent) == sent
 
 
-def scan(time: float) -> Any:
-    header = names(stamp=stamp(time))
-    field = {"angle_min": -math.pi, "angle_increment": math.pi / 180}
-    return names(header=header, **field, ranges=np.full(360, 5.0), range_min=0.1, range_max=8.0)
+def test_a_lost_scan_is_waited_for_and_a_jump_gives_up(started: Live) -> None:
+    around = started.around
+    around.aim(6.0)
+    assert started.until(lambda: around.states[-1] == "driving")
+    around.sees = False
+    assert started.until(lambda: around.states[-1] == "waiting" and around.sent[-1] == (0.0, 0.0))
+    assert around.statuses[-1]["reason"].startswith("stale scan")
+    around.sees = True
+    assert started.until(lambda: around.states[-1] == "driving")
+    around.pose[0] += 2.0
+    assert started.until(lambda: around.states[-1] == "given up" and around.sent[-1] == (0.0, 0.0))
+    assert around.statuses[-1]["reason"].startswith("odometry jumped")
 
 
-def goal(frame: str, x: float = 4.0) -> Any:
-    facing = names(x=0.0, y=0.0, z=math.sin(0.5), w=math.cos(0.5))
-    pose = names(position=names(x=x, y=0.0), orientation=facing)
-    return names(header=names(frame_id=frame), pose=pose)
+def send(started: Live, meters: int) -> tuple[Any, list[Any]]:
+    """Send a goal by the action; its handle, and its feedback."""
+    client = ActionClient(started.around.node, Fibonacci, "navigate_to_pose")
+    assert started.until(client.server_is_ready)
+    heard: list[Any] = []
+    sent = client.send_goal_async(Fibonacci.Goal(order=meters), heard.append)
+    assert started.until(sent.done)
+    return sent.result(), heard
 
 
-def transform(time: float, x: float = 0.0) -> Any:
-    rotation = names(x=0.0, y=0.0, z=0.0, w=1.0)
-    found = names(translation=names(x=x, y=0.0), rotation=rotation)
-    return names(header=names(stamp=stamp(time)), transform=found)
+def test_the_action_succeeds_with_feedback(started: Live) -> None:
+    handle, heard = send(started, 2)
+    assert handle.accepted
+    ended = handle.get_result_async()
+    assert started.until(ended.done)
+    assert ended.result().status == SUCCEEDED
+    assert list(ended.result().result.sequence) == [len("arrived")]
+    assert [message.feedback.sequence[0] for message in heard][-1] <= 1 and len(heard) >= 2
 
 
-def feed(node: Any, world: World, time: float, frame: str = "odom") -> tuple[float, float]:
-    """Odometry and a scan of now; what is sent then."""
-    world.now = time
-    node._on_odometry(odometry(time, frame=frame))
-    node._on_scan(scan(time))
-    return world.sent[-1]
+def test_the_action_is_canceled_by_its_client(started: Live) -> None:
+    handle, _ = send(started, 5)
+    assert started.until(lambda: started.around.states[-1] == "driving")
+    ended, canceled = handle.get_result_async(), handle.cancel_goal_async()
+    assert started.until(lambda: canceled.done() and ended.done())
+    assert ended.result().status == CANCELED
+    assert started.until(lambda: started.around.sent[-1] == (0.0, 0.0))
 
 
-def begin(node: Any, world: World, frame: str = "odom") -> None:
-    """Have a node drive to a goal."""
-    node._on_odometry(odometry(10.0))
-    node._on_goal(goal(frame))
-    assert feed(node, world, 10.0) == DRIVES
+def test_another_goal_aborts_that_of_the_action_and_is_driven(started: Live) -> None:
+    first, _ = send(started, 5)
+    ended = first.get_result_async()
+    assert started.until(lambda: started.around.states[-1] == "driving")
+    second, _ = send(started, 2)
+    assert started.until(ended.done) and ended.result().status == ABORTED
+    ended = second.get_result_async()
+    assert started.until(ended.done) and ended.result().status == SUCCEEDED
 
 
-def driving(module: Any, world: World, frame: str = "odom") -> Any:
-    """A node on its path."""
-    node = module.PolicyNode()
-    begin(node, world, frame)
-    return node
+def test_an_action_of_an_inactive_node_is_rejected(started: Live) -> None:
+    started.node.trigger_deactivate()
+    assert not send(started, 2)[0].accepted
 
 
-def test_a_robot_that_sees_too_little_for_its_filter_is_rejected_at_the_start(
-    module: Any, world: World, tmp_path: Path
+def test_the_life_cycle_begins_where_a_manager_wants_and_stands_when_deactivated(
+    tmp_path: Path,
+) -> None:
+    def change(found: Live, label: str) -> bool:
+        request = ChangeState.Request()
+        request.transition.label = label
+        return bool(found.call(ChangeState, "mpfa_policy/change_state", request).success)
+
+    def state(found: Live) -> str:
+        answer = found.call(GetState, "mpfa_policy/get_state", GetState.Request())
+        return str(answer.current_state.label)
+
+    with live(PolicyNode, policy=straight(tmp_path)) as found:
+        around = found.around
+        assert state(found) == "unconfigured"
+        assert change(found, "configure") and state(found) == "inactive"
+        assert found.until(lambda: found.node.navigator.frames.odometry is not None)
+        around.aim(5.0)
+        found.until(lambda: False, 0.5)
+        assert around.sent == []
+        assert change(found, "activate")
+        around.aim(5.0)
+        assert found.until(lambda: around.sent and around.sent[-1][0] > 0.1)
+        assert change(found, "deactivate")
+        assert found.until(lambda: around.sent[-1] == (0.0, 0.0))
+        assert found.until(lambda: around.states[-1] == "canceled")
+        sent = len(around.sent)
+        found.until(lambda: False, 0.5)
+        assert set(around.sent[sent - 1 :]) == {(0.0, 0.0)} and len(around.sent) <= sent + 1
+        assert change(found, "cleanup") and found.node.navigator is None
+        assert around.goals.get_subscription_count() == 0
+        assert change(found, "configure") and change(found, "activate")
+        assert found.until(lambda: around.goals.get_subscription_count() > 0)
+        assert found.until(lambda: found.node.navigator.frames.odometry is not None)
+        around.aim(around.pose[0] + 2.0)
+        assert found.until(lambda: around.states[-1] == "arrived")
+
+
+def test_a_robot_that_sees_too_little_for_its_filter_is_rejected_when_it_is_configured(
+    tmp_path: Path,
 ) -> None:
     file = export_policy(load_policy("td3-rooms"), tmp_path / "rooms.onnx")
     narrow = tmp_path / "narrow.yaml"
@@ -105,186 +209,161 @@ def test_a_robot_that_sees_too_little_for_its_filter_is_rejected_at_the_start(
     narrow.write_text(
         json.dumps({name: value for name, value in fields.items() if value is not None})
     )
-    world.parameters |= {"policy": str(file), "robot": str(narrow), "clearance": 0.03}
-    with pytest.raises(ValueError, match=r"field_of_view must be at least 180 .* clearance=None"):
-        module.PolicyNode()
+    with (
+        live(PolicyNode, policy=file, robot=narrow, clearance=0.03) as found,
+        pytest.raises(ValueError, match=r"field_of_view must be at least 180 .* clearance=None"),
+    ):
+        found.node.start()
 
 
-def test_it_stops_the_robot_when_it_dies_of_an_exception(module: Any, world: World) -> None:
-    def spin(node: Any) -> None:
-        begin(node, world)
-        raise RuntimeError("a bad message")
+def test_parameters_change_while_it_drives_or_are_rejected_by_name(tmp_path: Path) -> None:
+    def change(found: Live, name: str, value: Any) -> Any:
+        request = SetParameters.Request(parameters=[parameter(name, value)])
+        answer = found.call(SetParameters, "mpfa_policy/set_parameters", request)
+        return answer.results[0]
 
-    world.spin = spin
-    with pytest.raises(RuntimeError, match="a bad message"):
-        module.main()
-    assert world.sent[-1] == STANDS
+    with live(PolicyNode, policy=turning(tmp_path), clearance=0.03) as found:
+        assert change(found, "stop_distance", 0.1).successful
+        found.node.start()
+        controller = found.node.navigator.controller
+        assert controller.stop_distance == 0.1
+        assert change(found, "goal_radius", 0.2).successful
+        assert controller.pilot.goal_radius == 0.2
+        assert change(found, "scan_timeout", 0.8).successful and controller.scan_timeout == 0.8
+        assert change(found, "clearance", 0.1).successful
+        found.until(lambda: found.node.navigator.frames.odometry is not None)
+        found.around.aim(1.0)
+        assert found.until(lambda: found.around.states[-1] == "arrived")
+        no = change(found, "robot", "burger")
+        assert not no.successful and no.reason.startswith("robot cannot change while")
+        no = change(found, "clearance", 0.0)
+        assert not no.successful and no.reason.startswith("clearance must stay positive")
+        assert found.node.get_parameter("robot").value == ""
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_it_stops_the_robot_when_it_is_told_to_end(module: Any, world: World, name: str) -> None:
-    def spin(node: Any) -> None:
-        begin(node, world)
-        signal.raise_signal(getattr(signal, name))
-
-    world.spin = spin
-    module.main()
-    assert world.sent[-1] == STANDS
-
-
-def test_a_check_that_fails_stops_the_robot_and_is_logged(
-    module: Any, world: World, monkeypatch: pytest.MonkeyPatch
+def test_a_check_that_fails_stops_the_robot_and_is_said(
+    started: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = driving(module, world)
+    around = started.around
+    around.aim(5.0)
+    assert started.until(lambda: around.sent and around.sent[-1][0] > 0.1)
 
     def fail(now: float) -> None:
         raise ZeroDivisionError("of the pilot")
 
     with monkeypatch.context() as patch:
-        patch.setattr(node.controller, "tick", fail)
-        node._tick()
-    assert world.sent[-1] == STANDS and node.controller.pilot.goal is None
-    assert world.logged[-1] == ("error", "stopped by ZeroDivisionError('of the pilot')")
-    assert feed(node, world, 10.05) == STANDS
+        patch.setattr(started.node.navigator.controller, "tick", fail)
+        assert started.until(lambda: around.sent[-1] == (0.0, 0.0))
+    assert started.until(lambda: around.states[-1] == "given up")
+    around.aim(5.0)
+    assert started.until(lambda: around.sent[-1][0] > 0.1)
 
 
-def test_an_old_transform_stops_it_until_a_new_one_comes(module: Any, world: World) -> None:
-    world.transform = transform(10.0)
-    node = driving(module, world, "map")
-    assert feed(node, world, 10.9) == DRIVES
-    assert feed(node, world, 11.1) == STANDS
-    assert world.logged[-1] == ("info", "stale transform: 1.1 s old")
-    world.transform = transform(11.1)
-    assert feed(node, world, 11.2) == DRIVES
-    world.transform = None
-    assert feed(node, world, 12.0) == DRIVES
-    assert feed(node, world, 12.2) == STANDS
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Those of signals are afterwards what they were."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {number: signal.getsignal(number) for number in numbers}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
-def test_without_stamps_a_transform_ages_from_when_it_last_came(module: Any, world: World) -> None:
-    world.parameters["trust_stamps"] = False
-    world.transform = transform(500.0)
-    node = driving(module, world, "map")
-    assert feed(node, world, 10.9) == DRIVES
-    assert feed(node, world, 11.1) == STANDS
-    world.transform = transform(501.0)
-    assert feed(node, world, 11.2) == DRIVES
-
-
-@pytest.mark.parametrize("frame", ["odom", "map"])
-def test_a_goal_before_the_first_odometry_waits_for_it(
-    module: Any, world: World, frame: str
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("end", ["SIGINT", "SIGTERM", "SIGHUP", "error"])
+def test_it_stops_the_robot_at_its_end(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, end: str
 ) -> None:
-    world.transform = transform(10.0)
-    node = module.PolicyNode()
-    node._on_goal(goal(frame))
-    node._tick()
-    assert world.sent == [STANDS]  # One stop, then none.
-    assert world.logged[-1][1] == f"goal in frame {frame!r}: there was no odometry yet"
-    assert feed(node, world, 10.0) == DRIVES
-    assert node.controller.pilot.goal == (4.0, 0.0)
+    sent: list[tuple[float, float]] = []
+
+    def spin(node: Any) -> None:
+        publish = node._publish
+        monkeypatch.setattr(
+            node, "_publish", lambda *speeds: (sent.append(speeds), publish(*speeds))
+        )
+        node._publish(0.5, 0.0)
+        if end == "error":
+            raise RuntimeError("a bad message")
+        signal.raise_signal(getattr(signal, end))
+
+    start, policy = PolicyNode.start, Parameter("policy", value=straight(tmp_path))
+    monkeypatch.setattr(rclpy, "spin", spin)
+    monkeypatch.setattr(
+        PolicyNode, "start", lambda node: (node.set_parameters([policy]), start(node))
+    )
+    if end == "error":
+        with pytest.raises(RuntimeError, match="a bad message"):
+            policy_node.main()
+    else:
+        policy_node.main()
+    assert sent[-1] == (0.0, 0.0)
 
 
-def test_a_goal_without_a_transform_waits_for_one(module: Any, world: World) -> None:
-    node = module.PolicyNode()
-    node._on_odometry(odometry(10.0))
-    node._on_goal(goal("map"))
-    assert feed(node, world, 10.0) == STANDS
-    assert world.logged[-1][1] == "goal in frame 'map': no such transform"
-    assert len(world.sent) == 1
-    world.transform = transform(10.1, x=2.0)
-    assert feed(node, world, 10.1) == DRIVES
-    assert node.controller.pilot.goal == (6.0, 0.0)
-
-
-def test_odometry_without_a_frame_is_named(module: Any, world: World) -> None:
-    node = module.PolicyNode()
-    node._on_odometry(odometry(10.0, frame=""))
-    node._on_goal(goal("odom"))
-    assert world.logged[-1][1] == "goal in frame 'odom': the odometry names no frame"
-    node._on_goal(goal(""))
-    assert feed(node, world, 10.0, frame="") == DRIVES
-
-
-@pytest.mark.parametrize("frame", ["odom", "map"])
-def test_odometry_of_another_frame_gives_up_the_goal(module: Any, world: World, frame: str) -> None:
-    world.transform = transform(10.0)
-    node = driving(module, world, frame)
-    assert feed(node, world, 10.05, frame="odom2") == STANDS
-    assert world.logged[-1] == ("info", "odometry jumped: from frame 'odom' to 'odom2'")
-    sent = len(world.sent)
-    node._tick()
-    assert len(world.sent) == sent
-    node._on_goal(goal("odom2"))
-    assert feed(node, world, 10.1, frame="odom2") == DRIVES
-
-
-def test_a_rate_of_zero_is_rejected(module: Any, world: World) -> None:
-    world.parameters["rate"] = 0.0
-    with pytest.raises(ValueError, match="rate must be positive, got 0"):
-        module.PolicyNode()
-
-
-def turning_robot(tmp_path: Path, **arguments: Any) -> str:
-    """The file of a policy of a Kobuki that wants to drive straight ahead."""
-    size = 45 if arguments else 42
-    layer = Linear(np.zeros((2, size), np.float32), np.ones(2, np.float32))
-    policy = Policy([layer], env_arguments={"robot": "kobuki", **arguments})
-    return str(export_policy(policy, tmp_path / "turns.onnx"))
-
-
-@pytest.mark.parametrize("asked", [True, False])
-def test_it_turns_to_the_heading_of_the_goal(
-    module: Any, world: World, tmp_path: Path, asked: bool
+@pytest.mark.usefixtures("handlers")
+def test_at_its_end_it_waits_until_the_last_order_has_arrived_whatever_signals_come(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    world.parameters |= {"policy": turning_robot(tmp_path), "goal_heading": asked}
-    node = module.PolicyNode()
-    node._on_odometry(odometry(10.0))
-    node._on_goal(goal("odom", x=0.1))
-    still = odometry(10.1)
-    still.twist.twist.linear.x = 0.0
-    world.now = 10.1
-    node._on_odometry(still)
-    node._on_scan(scan(10.1))
-    linear, angular = world.sent[-1]
-    assert linear == 0.0 and (angular > 0.0) == asked
-    assert (node.controller.pilot.goal is None) != asked
+    done: list[Any] = []
+    stop, start = PolicyNode.stop, PolicyNode.start
+
+    def stops(node: PolicyNode) -> None:
+        signal.raise_signal(signal.SIGINT)
+        stop(node)
+
+    monkeypatch.setattr(PolicyNode, "stop", stops)
+    monkeypatch.setattr(PolicyNode, "_publish", lambda node, *speeds: done.append(speeds))
+    monkeypatch.setattr(
+        Publisher, "wait_for_all_acked", lambda publisher, time: done.append(publisher.topic_name)
+    )
+    policy = Parameter("policy", value=straight(tmp_path))
+    monkeypatch.setattr(
+        PolicyNode, "start", lambda node: (node.set_parameters([policy]), start(node))
+    )
+    monkeypatch.setattr(rclpy, "spin", lambda node: signal.raise_signal(signal.SIGTERM))
+    policy_node.main()
+    assert done == [(0.0, 0.0), "/cmd_vel"]
 
 
-def occupancy(frame: str, wall: int) -> Any:
-    """A map of 8 x 6 m with a wall across, 4 m before its left edge, of cells with a chance."""
-    cells = np.full((60, 80), -1)
-    cells[:, 40] = wall
-    cells[30, 40] = 0
-    place = names(position=names(x=-2.0, y=-3.0), orientation=names(x=0.0, y=0.0, z=0.0, w=1.0))
-    info = names(width=80, height=60, resolution=0.1, origin=place)
-    return names(header=names(frame_id=frame), info=info, data=cells.ravel().tolist())
-
-
-@pytest.mark.parametrize("wall", [100, 40])
-def test_it_knows_the_map_of_the_topic_where_localization_has_it(
-    module: Any, world: World, tmp_path: Path, wall: int
+def test_a_node_that_is_cleaned_up_waits_until_its_last_order_has_arrived(
+    monkeypatch: pytest.MonkeyPatch, started: Live
 ) -> None:
-    world.parameters |= {"policy": turning_robot(tmp_path, memory="map"), "map_topic": "map"}
-    node = module.PolicyNode()
-    node._on_map(occupancy("map", wall))
-    world.transform = transform(10.0, x=1.0)
-    node._on_odometry(odometry(10.0))
-    node._on_goal(goal("odom"))
-    feed(node, world, 10.0)
-    pilot = node.controller.pilot
-    assert pilot.plan is node._plan[0]
-    # In the frame of the odometry the wall is at 3 m.
-    origin, levels = pilot._map._memory.arrays.origins[0], pilot._map._memory.arrays.levels[0]
-    column = round((3.05 - pilot._map._center[0] - origin[0]) / 0.1)
-    blocked = (levels[column, 10:50] == 3).mean()
-    assert blocked == 1.0 if wall == 100 else blocked < 0.3
-    world.transform = transform(10.2, x=1.5)
-    feed(node, world, 10.2)
-    assert pilot._plan.pose == pytest.approx((-0.5, -3.0, 0.0))
+    waited: list[str] = []
+    monkeypatch.setattr(
+        Publisher, "wait_for_all_acked", lambda publisher, time: waited.append(publisher.topic_name)
+    )
+    started.node.trigger_deactivate()
+    assert waited == []
+    started.node.trigger_cleanup()
+    assert waited == ["/cmd_vel"]
 
 
-def test_a_map_needs_a_policy_that_has_one(module: Any, world: World) -> None:
-    world.parameters["map_topic"] = "map"
-    with pytest.raises(ValueError, match="map_topic must be '' for a policy without a map"):
-        module.PolicyNode()
+@pytest.mark.usefixtures("handlers")
+def test_a_signal_that_a_callback_of_the_compiler_hides_ends_it_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def start(_: PolicyNode) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    def spin(_: PolicyNode) -> None:
+        raise AssertionError("the node runs")
+
+    monkeypatch.setattr(PolicyNode, "start", start)
+    monkeypatch.setattr(rclpy, "spin", spin)
+    policy_node.main()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_node_that_no_one_has_configured(number: signal.Signals) -> None:
+    with live(None) as found, node("policy_node", autostart=False) as process:
+        client = found.around.node.create_client(GetState, "mpfa_policy/get_state")
+
+        def answers() -> bool:
+            # A service may be there before who asks is known to it; a question is lost then.
+            future = client.call_async(GetState.Request())
+            return found.until(future.done, 1.0)
+
+        assert found.until(answers, 60.0)
+        process.send_signal(number)
+        assert process.wait(10.0) == 0

@@ -6,13 +6,19 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from mpfa_envs.checks import check_share
 from mpfa_envs.deploy.card import CardError
 from mpfa_envs.robots.drives import STRENGTH
+from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.safety.filter import SafetyFilter, check_view
 from mpfa_envs.sensing.lidar import ray_angles
+from mpfa_envs.sensing.scan import ScanError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from mpfa_envs.deploy.card import Card
     from mpfa_envs.robots.model import RobotModel
 
@@ -87,6 +93,8 @@ def turning(robot: RobotModel) -> float:
     return math.inf if robot.turn_acceleration is None else robot.turn_acceleration
 
 
+_BESIDE: Final = 0.01
+"""Cosine above which a direction is ahead."""
 _RAYS: Final = 5
 """Directions of a sector, any of which may be the one of the range that it reports."""
 _PARTS: Final = 5
@@ -137,3 +145,48 @@ def filter_of(
         clearance=clearance,
         braking=STRENGTH,
     )
+
+
+def reject_blind_front(blind: NDArray[np.float64]) -> None:
+    """Reject a scan that does not look at directions [rad] beside which a filter lets it drive."""
+    if (np.cos(blind) > _BESIDE).any():
+        raise ScanError(
+            "the scan must look at all directions up to 90 degrees from ahead for the "
+            "filter (clearance), which does not drive beside what is not seen"
+        )
+
+
+def nearest_admissible(
+    keep: SafetyFilter,
+    robot: RobotModel,  # of the policy
+    states: NDArray[np.float32],  # observations that the filter allows for, [S, O]
+    wheels: tuple[float, float],  # speeds [m/s]
+) -> tuple[float, float]:
+    """Speeds of the wheels nearest to those wanted that the filter allows [m/s]."""
+    slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
+    action = (2.0 * np.array(wheels, np.float32) - slow - fast) / (fast - slow)
+    return robot.wheel_speeds(keep.among(states, action))
+
+
+def cannot_turn(robot: RobotModel) -> ScanError:
+    """The error of a robot that would drive where it does not see, and cannot look there."""
+    return ScanError(
+        "the scan must reach 45 degrees to both sides of where the robot drives, as with "
+        f"min_wheel_speed = {robot.min_wheel_speed} it cannot turn on the spot"
+    )
+
+
+def ramped(
+    body: RobotModel,
+    wheel_base: float,  # [m]
+    last: tuple[float, float],  # forward and turning speed [m/s, rad/s]
+    wanted: tuple[float, float],
+    passed: float,  # [s]
+) -> tuple[float, float]:
+    """Speeds on the way to those wanted that a body reaches within a time."""
+    limits, half = body.wheel_limits, 0.5 * wheel_base
+    if math.isinf(min(limits.acceleration, limits.turning)):
+        return wanted
+    now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
+    left, right = changed(now, to, limits, 1.0, passed)
+    return 0.5 * (left + right), 0.5 * (right - left) / half

@@ -55,6 +55,8 @@ class WayBack:
         self._places: list[tuple[float, float]] = []
         self._target: tuple[float, float] | None = None
         self._since, self._stood = -math.inf, (0.0, 0.0)
+        self.count = 0
+        """How often it has driven back."""
 
     @property
     def stands_still(self) -> bool:
@@ -74,6 +76,7 @@ class WayBack:
             away = (place for place in reversed(self._places) if math.dist(place, (x, y)) >= _BACK)
             farthest = max(self._places, key=lambda place: math.dist(place, (x, y)))
             self._target, self._since, self._stood = next(away, farthest), time, (x, y)
+            self.count += 1
         driven = math.dist(self._stood, (x, y)) >= 0.8 * _BACK
         if self._target is None or driven or time - self._since >= _BACK_TIME:
             self._target = None
@@ -111,10 +114,22 @@ class Arrival:
         self._robot, self._late = robot, latency * pace
         self._wait = period + latency
         self._braking = robot.wheel_limits.acceleration / pace**2
-        self.radius = card.goal_radius if radius is None else check_positive("goal_radius", radius)
-        self._learned = self.radius >= card.goal_radius
+        self._learned_radius = card.goal_radius
+        self.set_radius(card.goal_radius if radius is None else radius)
         self.heading: float | None = None
         self._there = False
+
+    def set_radius(self, radius: float) -> None:
+        """Change the distance from the goal at which it has arrived [m]."""
+        self.radius = check_positive("goal_radius", radius)
+
+    def check(self, heading: float | None) -> None:
+        """Reject a heading for a robot that cannot turn on the spot."""
+        if heading is not None and not self.spot_speed > 0.0:
+            raise ValueError(
+                f"heading must be None for {self._robot.name}, which cannot turn on the spot "
+                f"(min_wheel_speed = {self._robot.min_wheel_speed}), got {heading}"
+            )
 
     def begin(self, heading: float | None) -> None:
         """Set out for a goal at which the robot has a heading [rad], or any."""
@@ -137,7 +152,7 @@ class Arrival:
 
     def fastest(self, pose: tuple[float, float, float], goal: tuple[float, float]) -> float:
         """Greatest speed of the policy's robot with which it stops at the goal [m/s]."""
-        as_learned = self.heading is None and self._learned
+        as_learned = self.heading is None and self.radius >= self._learned_radius
         if as_learned or not self._robot.can_stop or math.isinf(self._braking):
             return math.inf
         # Half the braking, as decisions are late; what remains at the goal is stopped within it.

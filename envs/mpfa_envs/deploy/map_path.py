@@ -12,6 +12,7 @@ import numpy as np
 
 from mpfa_envs.checks import MEANT, check_meant
 from mpfa_envs.deploy.card import check_finite
+from mpfa_envs.deploy.reach import Reach
 from mpfa_envs.sensing.map_loops import UNKNOWN
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.sectors import Points
@@ -26,6 +27,10 @@ _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _LARGEST_MAP: Final = 2.0 * MEANT["map_size"][1]
 """Side of the square around a robot in which its goal must be, without a map, too [m]."""
+
+
+class GoalError(ValueError):
+    """A goal that cannot be reached; the message says why."""
 
 
 def pair_of(name: str, place: tuple[float, float]) -> tuple[float, float]:
@@ -67,7 +72,7 @@ def check_on_map(
         size = f"{width:g} m" + " (map_size)" * (map_size is not None)
         if plan is not None:
             size = f"{width:g} m x {depth:g} m (plan)"
-        raise ValueError(
+        raise GoalError(
             f"goal must be on the map, {size} around "
             f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
         )
@@ -79,6 +84,14 @@ class Plan(NamedTuple):
     world: World
     pose: tuple[float, float, float]
     """Of the plan's frame in that of the odometry (x, y, heading) [m, m, rad]."""
+
+    def check(self, *, has_map: bool, center: tuple[float, float] | None) -> None:
+        """Reject a plan for a policy without a map, or beside a center of the map."""
+        if not has_map or center is not None:
+            raise ValueError(
+                "plan must be None for a policy without a map (memory='map'), and with a "
+                f"map_center, got {self.world.name!r}"
+            )
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -105,7 +118,7 @@ class Plan(NamedTuple):
 
 
 class MapPath:
-    """A map around a place, and the path over it to the goal."""
+    """A map around a place, the path over it to the goal, and whether there is one."""
 
     def __init__(self, card: Card) -> None:
         # Without Numba the loops would run, but a thousand times more slowly.
@@ -115,10 +128,12 @@ class MapPath:
         lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
         self._center = np.zeros(2)
+        self._reach, self._far = Reach(card.robot.radius), card.max_range
         # The loops are compiled by their first call, which takes seconds.
         self.begin((0.0, 0.0), (10.0, 10.0))
         here = np.zeros(3)
         self.sense(here, here, (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
+        self.closes_in((1.0, 0.0), 0.5, (0.0, 0.0))
 
     def begin(
         self, center: tuple[float, float], size: tuple[float, float], plan: Plan | None = None
@@ -127,14 +142,32 @@ class MapPath:
         self._center[:] = center
         extent: Any = SimpleNamespace(size=size)
         if plan is None:
+            self._reach.begin(center, size)
             self._memory.begin(0, extent)
         else:
+            self._reach.begin(center, size, plan.world, (*plan.middle, plan.pose[2]))
             x, y = np.subtract(plan.middle, center).tolist()
             self._memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
 
     def look_again(self) -> None:
         """The goal has moved: no path to it is known."""
         self._memory.arrays.costs[0] = UNKNOWN
+
+    def closes_in(
+        self, goal: tuple[float, float], radius: float, place: tuple[float, float]
+    ) -> bool:
+        """Return True if what is known keeps a place from within a radius of a goal [m]."""
+        return self._reach.closes_in(goal, radius, place)
+
+    def reject_closed(
+        self, goal: tuple[float, float], radius: float, place: tuple[float, float]
+    ) -> None:
+        """Reject a goal that the plan closes in."""
+        if self.closes_in(goal, radius, place):
+            x, y = goal
+            raise GoalError(
+                f"goal must be reachable, got ({x:.2f}, {y:.2f}): the plan closes it in"
+            )
 
     def sense(
         self,
@@ -144,6 +177,8 @@ class MapPath:
         points: Points,
     ) -> NDArray[np.float64]:
         """Enter points taken at a pose; direction (x, y) and length of the path, ``[1, 3]``."""
+        x, y, heading = taken[:3].tolist()
+        self._reach.see(x, y, points.angles + heading, points.ranges, self._far)
         poses = np.zeros((2, 1, 5))
         poses[:, 0, :3] = pose[:3], taken[:3]
         poses[:, 0, :2] -= self._center

@@ -7,15 +7,24 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_not_negative, check_number, check_positive
-from mpfa_envs.deploy.adaptation import body_of, filter_of, pace_of, tolerance
+from mpfa_envs.checks import check_not_negative, check_number
+from mpfa_envs.deploy.adaptation import (
+    body_of,
+    cannot_turn,
+    filter_of,
+    nearest_admissible,
+    pace_of,
+    ramped,
+    reject_blind_front,
+    tolerance,
+)
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
+from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
-from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
+from mpfa_envs.deploy.map_path import pair_of
 from mpfa_envs.robots.drives import Orders
-from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.sensing.scan import Scan, ScanError
+from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
@@ -28,8 +37,6 @@ if TYPE_CHECKING:
 
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
-_BESIDE: Final = 0.01
-"""Cosine above which a direction is ahead."""
 
 
 class Command(NamedTuple):
@@ -109,22 +116,12 @@ class Pilot:
             card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
         )
         self._network = network
-        side = check_positive("map_size", map_size)
-        self._map_size = side if card.memory == "map" else None
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
-        self.goal_radius = self._arrival.radius
-        self._map: MapPath | None = None
-        if card.memory == "map":
-            # Its loops are compiled before the first decision is due.
-            self._map = MapPath(card)
+        self._ground = Ground(card, map_size)
         self._body = body_of(card.robot, self.robot, self.pace)
         self._keep = filter_of(card, self.robot, self._body, clearance)
-        self._goal: tuple[float, float] | None = None
-        self._center: tuple[float, float] | None = None
-        self._plan: Plan | None = None
-        self._fresh_map, self._fresh = False, True
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -154,6 +151,23 @@ class Pilot:
         return self.card.period / self.pace
 
     @property
+    def goal_radius(self) -> float:
+        """Distance from the goal at which it has arrived [m]."""
+        return self._arrival.radius
+
+    def adjust(self, *, clearance: float | None = None, goal_radius: float | None = None) -> None:
+        """Change clearance or goal radius, also while driving; None leaves it as it is [m]."""
+        if clearance is not None:
+            self._keep = filter_of(self.card, self.robot, self._body, clearance)
+        if goal_radius is not None:
+            self._arrival.set_radius(goal_radius)
+
+    @property
+    def recoveries(self) -> int:
+        """How often the robot has driven back since it set out."""
+        return self._way_back.count
+
+    @property
     def has_filter(self) -> bool:
         """True if a filter keeps the robot off what it sees."""
         return self._keep is not None
@@ -161,12 +175,13 @@ class Pilot:
     @property
     def goal(self) -> tuple[float, float] | None:
         """The goal (x, y) [m]; None without."""
-        return self._goal
+        return self._ground.goal
 
     @property
     def plan(self) -> World | None:
         """The building that :meth:`begin` was given; None without, and without a goal."""
-        return None if self._plan is None or self._goal is None else self._plan.world
+        plan = self._ground.plan
+        return None if plan is None or self.goal is None else plan.world
 
     @property
     def turns_on_the_spot(self) -> bool:
@@ -200,30 +215,14 @@ class Pilot:
                 is a plan without a map or with a center, or a heading for a robot that cannot turn
                 on the spot.
         """
-        if heading is not None and not self.turns_on_the_spot:
-            raise ValueError(
-                f"heading must be None for {self.robot.name}, which cannot turn on the spot "
-                f"(min_wheel_speed = {self.robot.min_wheel_speed}), got {heading}"
-            )
-        center = None if map_center is None else pair_of("map_center", map_center)
-        goal = pair_of("goal", goal)
-        ground = None
-        if plan is not None:
-            if self._map is None or center is not None:
-                raise ValueError(
-                    "plan must be None for a policy without a map (memory='map'), and with a "
-                    f"map_center, got {plan.name!r}"
-                )
-            ground = plan_at(plan, plan_pose)
-            center = ground.middle
-        check_on_map(goal, center, ground, self._map_size)
+        self._arrival.check(heading)
+        self._ground.begin(goal, map_center, plan, plan_pose)
         self._arrival.begin(heading)
-        self._goal, self._center, self._plan, self._fresh = goal, center, ground, True
         self._way_back = WayBack(self.card.robot, self.period)
 
     def stop(self) -> None:
         """Give up the goal."""
-        self._goal = None
+        self._ground.goal = None
 
     def move_goal(self, goal: tuple[float, float], *, heading: float | None = None) -> None:
         """Correct the goal while driving; the map is kept.
@@ -236,15 +235,11 @@ class Pilot:
             ValueError: If it is not finite, beyond 1e7 m or not on the map, or the robot has not
                 set out.
         """
-        if self._goal is None:
+        if self.goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
         if heading is not None and self._arrival.heading is not None:
             self._arrival.heading = check_number("heading", heading)
-        if (goal := pair_of("goal", goal)) != self._goal:
-            check_on_map(goal, self._center, self._plan, self._map_size)
-            self._goal = goal
-            if self._map is not None:
-                self._map.look_again()
+        self._ground.move_goal(goal)
 
     def move_plan(self, pose: tuple[float, float, float]) -> None:
         """Correct the pose of the plan while driving, as localization does.
@@ -257,17 +252,19 @@ class Pilot:
         Raises:
             ValueError: If a number is not finite or too large, or there is no plan.
         """
-        if self._plan is None:
-            raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
-        moved = plan_at(self._plan.world, pose)
-        if self._plan.is_off(moved.pose):
-            self._plan, self._center, self._fresh_map = moved, moved.middle, True
+        self._ground.move_plan(pose)
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
         """Return True if a pose is at the goal, with the heading that :meth:`begin` was given."""
-        if self._goal is None:
-            return False
-        return self._arrival.is_at(pose, math.dist(pose[:2], self._goal))
+        goal = self.goal
+        return goal is not None and self._arrival.is_at(pose, math.dist(pose[:2], goal))
+
+    def closed_in(self, place: tuple[float, float]) -> bool:
+        """Return True if all paths from a place (x, y) to the goal cross walls that are known.
+
+        Unseen places count as free. Without a map nothing is known.
+        """
+        return self._ground.closes_in(self.goal_radius, place)
 
     def observe(
         self,
@@ -310,7 +307,7 @@ class Pilot:
         age: float,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
         """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
-        if self._goal is None:
+        if self.goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
         pair_of("pose", (x, y))
@@ -322,20 +319,13 @@ class Pilot:
         )
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
-        card = self.card
-        center = self._center or (x, y)
-        check_on_map(self._goal, center, self._plan, self._map_size)
+        self._ground.check_at((x, y))
         ranges, points = self.sectors.read(scan)
-        path = np.zeros((0, 3))
-        if self._map is not None:
-            if self._fresh or self._fresh_map:
-                self._map.begin(center, sides_of(self._plan, self._map_size), self._plan)
-                self._center, self._fresh_map = center, False
-            path = self._map.sense(ahead[0], taken, self._goal, points)
-        facts = self._goal, self._fresh, path, self.pace
-        rows = observations_from(ahead, ranges, points, taken, card, self._observation, *facts)
+        path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
+        facts = self.goal, self._ground.is_new, path, self.pace
+        rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
-        self._fresh = False
+        self._ground.is_new = False
         return rows[0], rows, float(ahead[0, 2] - taken[2])
 
     def give(self, time: float, linear: float, angular: float) -> None:
@@ -371,7 +361,7 @@ class Pilot:
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
         observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        slower = math.inf if self._goal is None else self._arrival.fastest(pose, self._goal)
+        slower = math.inf if self.goal is None else self._arrival.fastest(pose, self.goal)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
@@ -386,35 +376,22 @@ class Pilot:
         if backwards or (np.abs(towards) < _TOWARDS).any():
             most = min(learned.max_wheel_speed, -learned.min_wheel_speed)
             if most <= 0.0:
-                raise self._cannot_turn()
+                raise cannot_turn(self.robot)
             right = min(max(0.5 * (right - left), -most), most)
             left = -right
         if self._keep is not None:
-            if (np.cos(blind) > _BESIDE).any():
-                raise ScanError(
-                    "the scan must look at all directions up to 90 degrees from ahead for the "
-                    "filter (clearance), which does not drive beside what is not seen"
-                )
+            reject_blind_front(blind)
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             states[:, : self.card.sectors][:, hidden] = 1.0
-            slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
-            action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
-            left, right = learned.wheel_speeds(self._keep.among(states, action))
+            left, right = nearest_admissible(self._keep, learned, states, (left, right))
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
-
-    def _cannot_turn(self) -> ScanError:
-        """The error of a robot that would drive where it does not see, and cannot look there."""
-        return ScanError(
-            "the scan must reach 45 degrees to both sides of where the robot drives, as with "
-            f"min_wheel_speed = {self.robot.min_wheel_speed} it cannot turn on the spot"
-        )
 
     def _command(self, linear: float, angular: float) -> Command:
         """The command for speeds of the body [m/s, rad/s]."""
         turn = 0.5 * angular * self.robot.wheel_base
         if linear - abs(turn) < self.robot.min_wheel_speed - tolerance(self.robot):
-            raise self._cannot_turn()
+            raise cannot_turn(self.robot)
         self.give(self._time, linear, angular)
         return Command(linear - turn, linear + turn, linear, angular)
 
@@ -436,9 +413,4 @@ class Pilot:
         Returns:
             The speeds to order.
         """
-        limits, half = self._body.wheel_limits, 0.5 * self.card.robot.wheel_base
-        if math.isinf(min(limits.acceleration, limits.turning)):
-            return wanted
-        now, to = ((v - half * turn, v + half * turn) for v, turn in (last, wanted))
-        left, right = changed(now, to, limits, 1.0, passed * self.pace**2)
-        return 0.5 * (left + right), 0.5 * (right - left) / half
+        return ramped(self._body, self.card.robot.wheel_base, last, wanted, passed * self.pace**2)

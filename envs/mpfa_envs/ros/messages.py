@@ -30,6 +30,17 @@ def yaw(orientation: Any) -> float:
     return math.atan2(2.0 * (w * z + x * y) / norm, 1.0 - 2.0 * (y * y + z * z) / norm)
 
 
+def mount_of(transform: Any) -> tuple[float, float, float, float]:
+    """Position, direction of the x axis and roll of a lidar by a ``geometry_msgs/Transform``.
+
+    The roll is 0, or π for one that hangs upside down.
+    """
+    place, turn = transform.translation, transform.rotation
+    x, y, z, w = (float(getattr(turn, name)) for name in "xyzw")
+    upright = 2.0 * (x * x + y * y) < x * x + y * y + z * z + w * w
+    return float(place.x), float(place.y), yaw(turn), 0.0 if upright else math.pi
+
+
 def scan_of(message: Any) -> Scan:
     """A ``sensor_msgs/LaserScan``."""
     return Scan(

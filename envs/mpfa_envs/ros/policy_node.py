@@ -1,117 +1,179 @@
-"""The ROS 2 node of a policy: messages in and out, all else is in :class:`Controller`."""
+"""The ROS 2 node of a policy: its life cycle, its topics, and messages in and out.
+
+What they mean is in :class:`~mpfa_envs.ros.navigator.Navigator`, and all decisions are in
+:class:`~mpfa_envs.ros.controller.Controller`.
+"""
 
 from __future__ import annotations
 
-import math
 import signal
 from contextlib import suppress
 from functools import partial
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.node import Node
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 
 from mpfa_envs.checks import check_positive
-from mpfa_envs.deploy import Pilot
-from mpfa_envs.ros.controller import Controller
-from mpfa_envs.ros.messages import (
-    Pose,
-    odometry_of,
-    plan_of,
-    scan_of,
-    seconds,
-    transformed,
-    yaw,
-)
-from mpfa_envs.worlds.world import World
+from mpfa_envs.ros.frames import Frames
+from mpfa_envs.ros.messages import seconds, yaw
+from mpfa_envs.ros.navigate_action import ActionType, NavigateAction, NavigateToPose
+from mpfa_envs.ros.navigator import Navigator
+from mpfa_envs.ros.parameters import PARAMETERS, change, check_change, make_controller
+from mpfa_envs.ros.status import Status, feedback
 
-PARAMETERS: Final[dict[str, Any]] = {
-    "policy": "",
-    "robot": "",
-    "pace": 0.0,
-    "mount": [0.0, 0.0, 0.0],
-    "unseen": 0.0,
-    "silent": "reject",
-    "map_size": 40.0,
-    "clearance": 0.0,
-    "latency": -1.0,
-    "goal_radius": 0.0,
-    "goal_heading": True,
-    "stop_distance": 0.05,
-    "scan_timeout": 0.5,
-    "odometry_timeout": 0.5,
-    "transform_timeout": 1.0,
-    "rate": 20.0,
-    "trust_stamps": True,
-    "stamped": False,
-    "base_frame": "base_link",
-    "scan_topic": "scan",
-    "odometry_topic": "odom",
-    "goal_topic": "goal_pose",
-    "map_topic": "",
-    "command_topic": "cmd_vel",
-}
-"""The parameters with their defaults; docs/robot.md explains them."""
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mpfa_envs.ros.controller import Order, State
+
+_FEEDBACK: Final = 0.5
+"""Time from one feedback to the next [s]."""
+_WATCH: Final = 0.1
+"""Time from one look at the clock to the next [s]."""
+_FROZEN: Final = 0.5
+"""Time for which the clock may stand still while the robot drives [s]."""
+_ACKNOWLEDGED: Final = 0.5
+"""Longest time that the node waits at its end for those who have not yet got its last order [s]."""
+_LATCHED: Final = {"depth": 1, "durability": DurabilityPolicy.TRANSIENT_LOCAL}
 
 
-class PolicyNode(Node):
-    """Subscribes scan, odometry and goal, publishes speeds."""
+class PolicyNode(LifecycleNode):
+    """Subscribes scan, odometry and goal, publishes speeds and what has become of the goal."""
 
-    def __init__(self) -> None:
+    def __init__(self, action: Callable[[], ActionType] = NavigateToPose) -> None:
         super().__init__("mpfa_policy")
         for name, default in PARAMETERS.items():
             self.declare_parameter(name, default)
-        value = self._value
-        options = {name: value(name) for name in ("silent", "map_size")}
-        pilot = Pilot.load(
-            value("policy"),
-            robot=value("robot") or None,
-            pace=value("pace") or None,
-            mount=tuple(value("mount")) if any(value("mount")) else None,
-            unseen=value("unseen") or None,
-            clearance=value("clearance") or None,
-            latency=None if value("latency") < 0.0 else value("latency"),
-            goal_radius=value("goal_radius") or None,
-            **options,
-        )
-        rate = check_positive("rate", value("rate"))
-        limits = {n: value(n) for n in ("stop_distance", "scan_timeout", "odometry_timeout")}
-        self.controller = Controller(pilot, **limits, check_period=1.0 / rate)
-        self._stamped = value("stamped")
-        self._trust_stamps = value("trust_stamps")
-        self._base_frame = value("base_frame")
-        self._transform_timeout = check_positive("transform_timeout", value("transform_timeout"))
-        self._odometry_frame: str | None = None
-        self._goal: tuple[Pose, str] | None = None
-        self._plan: tuple[World, Pose, str] | None = None
-        self._turns = value("goal_heading") and pilot.turns_on_the_spot
-        self._waits = ""
-        self._stamp, self._stamped_at = -math.inf, -math.inf
-        self._reason = ""
-        self._transforms = self._listen()
-        kind = TwistStamped if self._stamped else Twist
-        self._commands = self.create_publisher(kind, value("command_topic"), 1)
-        sensor = partial(self.create_subscription, qos_profile=qos_profile_sensor_data)
-        sensor(LaserScan, value("scan_topic"), self._on_scan)
-        sensor(Odometry, value("odometry_topic"), self._on_odometry)
-        self.create_subscription(PoseStamped, value("goal_topic"), self._on_goal, 1)
-        if topic := value("map_topic"):
-            if pilot.card.memory != "map":
-                raise ValueError(f"map_topic must be '' for a policy without a map, got {topic!r}")
-            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self.create_subscription(OccupancyGrid, topic, self._on_map, latched)
-        self.create_timer(1.0 / rate, self._tick)
+        self._action_type = action
+        self.failure: Exception | None = None
+        """Why it could not be configured."""
+        self.is_driving = False
+        """True while the node is active."""
+        self.navigator: Navigator | None = None
+        """None unless the node is configured."""
+        self._action: NavigateAction | None = None
+        self._commands: Any = None
+        self._undo: list[Callable[[], Any]] = []
+        self._goals, self._reason, self._told_at = 0, "", -1.0
+        self._kind: tuple[Any, ...] = ()
+        # A clock of a simulator may stop, and with it all that counts its time.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._ticked, self._ticked_at, self._frozen = 0, 0, ""
+        # Also before it is configured: a node that nothing wakes does not hear a signal.
+        self.create_timer(_WATCH, self._watch, clock=self._steady)
+        self.add_on_set_parameters_callback(self._on_parameters)
+
+    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+        """Load the policy and open the topics; it fails if a parameter does not fit."""
+        try:
+            self._configure()
+        # Whatever it is: rclpy would hide it.
+        except Exception as error:
+            self.failure = error
+            self.get_logger().error(f"not configured: {error}")
+            self._clean_up()
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+        """Take goals from now on."""
+        self.is_driving = True
+        self._tell()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+        """Give up the goal and stand."""
+        self._halt("the node was deactivated")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+        """Close the topics and forget the policy."""
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+        """Stand, whatever the node does."""
+        self._halt("the node was shut down")
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: Any) -> TransitionCallbackReturn:
+        """Stand, and be configured again."""
+        return self.on_shutdown(state)
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
 
-    def _listen(self) -> Any:
+    def _configure(self) -> None:
+        value = self._value
+        controller = make_controller(value)
+        timeout = check_positive("transform_timeout", value("transform_timeout"))
+        frames = Frames(self._listen(), trust_stamps=value("trust_stamps"))
+        self.navigator = Navigator(
+            controller,
+            frames,
+            trust_stamps=value("trust_stamps"),
+            turns=value("goal_heading"),
+            transform_timeout=timeout,
+            base=value("base_frame"),
+        )
+        self._stamped, self._base_frame = value("stamped"), value("base_frame")
+        kind = TwistStamped if self._stamped else Twist
+        self._commands = self._publish_on(kind, value("command_topic"), 1)
+        self._statuses = self._publish_on(DiagnosticStatus, "~/status", QoSProfile(**_LATCHED))
+        self._feedbacks = self._publish_on(Float64MultiArray, "~/feedback", 1)
+        self._hear(LaserScan, value("scan_topic"), self._on_scan, qos_profile_sensor_data)
+        self._hear(Odometry, value("odometry_topic"), self._on_odometry, qos_profile_sensor_data)
+        self._hear(PoseStamped, value("goal_topic"), self._on_goal, 1)
+        if topic := value("map_topic"):
+            self._hear(OccupancyGrid, topic, self.navigator.know, QoSProfile(**_LATCHED))
+        service = self.create_service(Trigger, "~/cancel", self._on_cancel)
+        self._undo.append(partial(self.destroy_service, service))
+        checks = self.create_timer(1.0 / value("rate"), self._tick)
+        self._undo.append(partial(self.destroy_timer, checks))
+        self._serve_action()
+
+    def _publish_on(self, kind: Any, topic: str, quality: Any) -> Any:
+        publisher = self.create_publisher(kind, topic, quality)
+        self._undo.append(partial(self.destroy_publisher, publisher))
+        return publisher
+
+    def _hear(self, kind: Any, topic: str, call: Callable[[Any], None], quality: Any) -> None:
+        subscription = self.create_subscription(kind, topic, call, quality)
+        self._undo.append(partial(self.destroy_subscription, subscription))
+
+    def _serve_action(self) -> None:
+        """Serve the action, where its type is installed."""
+        if not (name := self._value("action")):
+            return
+        try:
+            kind = self._action_type()
+        except ImportError:
+            return
+        self._action = NavigateAction(
+            self,
+            name,
+            kind,
+            accepts=lambda: self.is_driving,
+            begin=self._on_goal,
+            cancel=lambda: self._cancel("canceled"),
+        )
+        self._undo.append(self._action.destroy)
+
+    def _listen(self) -> Callable[[str, str], Any] | None:
         """The transforms between frames, where tf2 is installed."""
         try:
             from tf2_ros import Buffer, TransformListener
@@ -119,122 +181,134 @@ class PolicyNode(Node):
             return None
         buffer = Buffer()
         self._listener = TransformListener(buffer, self)
-        return buffer
+        return lambda target, source: buffer.lookup_transform(target, source, Time())
+
+    def _clean_up(self) -> None:
+        self.wait_for_listeners()
+        while self._undo:
+            self._undo.pop()()
+        self.navigator = self._action = self._commands = None
+        self._listener = None
 
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
-    def _time_of(self, header: Any) -> float:
-        return seconds(header.stamp) if self._trust_stamps else self._now()
+    def _on_parameters(self, parameters: Any) -> SetParametersResult:
+        changes = {each.name: each.value for each in parameters}
+        if self.navigator is not None:
+            try:
+                check_change(changes, self.navigator.controller)
+                change(changes, self.navigator.controller)
+            except ValueError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
     def _on_scan(self, message: Any) -> None:
-        self.controller.see(scan_of(message), self._time_of(message.header))
-        self._tick()
+        if self.navigator is not None:
+            try:
+                self.navigator.see(message, self._now())
+            except ValueError as error:
+                # The last scan grows old, which stops the robot.
+                self.get_logger().error(f"scan: {error}", throttle_duration_sec=5.0)
+            self._tick()
 
     def _on_odometry(self, message: Any) -> None:
-        last, self._odometry_frame = self._odometry_frame, message.header.frame_id
-        if last not in (None, self._odometry_frame) and self._goal is not None:
-            self._goal, self._waits = None, ""
-            there = f"from frame {last!r} to {self._odometry_frame!r}"
-            self.controller.aim(None, f"odometry jumped: {there}")
-        self.controller.feel(*odometry_of(message), self._time_of(message.header))
+        if self.navigator is not None:
+            self.navigator.feel(message, self._now())
 
     def _on_goal(self, message: Any) -> None:
-        heading = yaw(message.pose.orientation) if self._turns else math.nan
-        pose = message.pose.position.x, message.pose.position.y, heading
-        self._goal, self._waits = (pose, message.header.frame_id), ""
-        self._stamp = self._stamped_at = -math.inf
-        self.controller.aim(None)
-        self._set_out()
+        if self.navigator is None or not self.is_driving:
+            self.get_logger().warning("goal ignored: the node is not active")
+            return
+        self._cancel("another goal has come")
+        self._goals += 1
+        place = message.pose.position
+        pose = place.x, place.y, yaw(message.pose.orientation)
+        stamp = seconds(message.header.stamp)
+        self.navigator.aim(pose, message.header.frame_id, stamp, self._now())
         self._tick()
 
-    def _on_map(self, message: Any) -> None:
-        # A map that comes while the robot drives is for the next goal.
-        self._plan = (*plan_of(message), message.header.frame_id)
+    def _on_cancel(self, request: Any, response: Any) -> Any:
+        response.success = self.navigator is not None and self.navigator.is_active
+        response.message = "canceled" if response.success else "there is no goal"
+        self._cancel("canceled")
+        return response
 
-    def _place_plan(self) -> None:
-        """Give the controller the plan, where localization has it."""
-        if self._plan is not None:
-            plan, pose, frame = self._plan
-            self.controller.know(plan, self._in_odometry(pose, frame))
+    def _cancel(self, reason: str) -> None:
+        """Give up the goal, if there is one, and stand."""
+        if self.navigator is not None and self.navigator.is_active:
+            self.navigator.cancel(reason)
+            self._tick()
 
-    def _set_out(self) -> None:
-        """Set out for the goal if its place is known; else it is tried again at each check."""
-        if self._goal is None:
-            return
-        try:
-            x, y, heading = self._in_odometry(*self._goal)
-            self._place_plan()
-            self.controller.aim((x, y), heading=None if math.isnan(heading) else heading)
-        # What tf2 raises has no public base class.
-        except Exception as error:
-            reason = f"goal in frame {self._goal[1]!r}: {error}"
-            if not self._waits:
-                self.controller.aim(None, reason)
-            self._waits = reason
-        else:
-            self._waits = ""
+    def _halt(self, reason: str) -> None:
+        """Give up the goal, stand, and take none."""
+        if self.navigator is not None:
+            self._cancel(reason)
+            self.stop()
+        self.is_driving = False
 
-    def _in_odometry(self, place: Pose, frame: str) -> Pose:
-        """Transform a pose of another frame into that of the odometry."""
-        if frame in ("", self._odometry_frame):
-            return place
-        if self._transforms is None:
-            raise LookupError("tf2_ros is not installed")
-        if self._odometry_frame is None:
-            raise LookupError("there was no odometry yet")
-        if not self._odometry_frame:
-            raise LookupError("the odometry names no frame")
-        found = self._transforms.lookup_transform(self._odometry_frame, frame, Time())
-        stamp = seconds(found.header.stamp)
-        if stamp != self._stamp:
-            self._stamp, self._stamped_at = stamp, self._now()
-        return transformed(place, found.transform)
-
-    def _correct(self) -> None:
-        """Update goal and plan by the newest transform; an old one keeps the robot standing."""
-        frames = {placed[-1] for placed in (self._goal, self._plan) if placed}
-        if self._goal is None or not frames - {"", self._odometry_frame}:
-            return
-        try:
-            x, y, heading = self._in_odometry(*self._goal)
-            self._place_plan()
-            self.controller.correct_goal((x, y), None if math.isnan(heading) else heading)
-        # As above; a correction that fails once is made later.
-        except Exception as error:
-            warn = self.get_logger().warning
-            warn(f"goal not corrected: {error}", throttle_duration_sec=5.0)
-        age = self._now() - (self._stamp if self._trust_stamps else self._stamped_at)
-        # Transforms that never change have no time.
-        old = self._stamp != 0.0 and not age <= self._transform_timeout
-        self.controller.hold(f"stale transform: {age:.1f} s old" if old else "")
+    def _watch(self) -> None:
+        """Stop a driving robot where the clock stands still."""
+        now, steady = self.get_clock().now().nanoseconds, self._steady.now().nanoseconds
+        if now != self._ticked:
+            self._ticked, self._ticked_at, self._frozen = now, steady, ""
+        elif self.navigator is not None and self.navigator.is_active:
+            passed = 1e-9 * (steady - self._ticked_at)
+            if passed > _FROZEN:
+                self._frozen = f"the clock stands still: for {passed:.1f} s"
+                self._order(self.navigator.controller.stand(self._frozen))
+                self._tell()
 
     def _tick(self) -> None:
+        if self.navigator is None or not self.is_driving:
+            return
         try:
-            self._check()
+            self._check(self.navigator)
         # Whatever it is: a robot that no one checks must not drive on.
         except Exception as error:
             self.get_logger().error(f"stopped by {error!r}")
-            self._goal, self._waits = None, ""
-            self.controller.aim(None, "failed")
+            self.navigator.fail()
             self.stop()
+            self._tell()
 
-    def _check(self) -> None:
-        """Publish what the controller says."""
-        if self._waits:
-            self._set_out()
-        elif self.controller.pilot.goal is None:
-            self._goal = None
-        else:
-            self._correct()
-        order = self.controller.tick(self._now())
-        if order is None:
-            return
-        reason = order.reason.partition(":")[0]
-        if reason != self._reason:
-            self._reason = reason
-            self.get_logger().info(order.reason)
+    def _check(self, navigator: Navigator) -> None:
+        """Publish what the navigator orders."""
+        # Not by the node's clock: one of a simulator does not go on while the node decides.
+        began = self._steady.now().nanoseconds
+        order = navigator.check(self._now())
+        passed = 1e-9 * (self._steady.now().nanoseconds - began)
+        if passed > navigator.controller.scan_timeout and navigator.is_active:
+            order = navigator.controller.stand(f"too late: the decision took {passed:.1f} s")
+        if order is not None:
+            self._order(order)
+        self._tell()
+
+    def _order(self, order: Order) -> None:
+        self._reason = order.reason
         self._publish(order.linear, order.angular)
+
+    def _tell(self) -> None:
+        """Publish status and feedback where they have changed or are due."""
+        navigator, now = self.navigator, self._now()
+        if navigator is None:
+            return
+        frozen = self._frozen if navigator.is_active else ""
+        reason = frozen or navigator.waits or self._reason
+        state: State = "waiting" if frozen else navigator.state
+        status = Status(state, reason, navigator.controller.note(now), self._goals)
+        if status.kind != self._kind:
+            self._kind = status.kind
+            message = status.message(self.get_name())
+            self._statuses.publish(message)
+            self.get_logger().info(f"{status.state}: {message.message}")
+        if self._action is not None and not navigator.is_active:
+            self._action.end(status)
+        if navigator.is_active and not 0.0 <= now - self._told_at < _FEEDBACK:
+            self._told_at = now
+            progress = navigator.progress(now)
+            self._feedbacks.publish(feedback(progress))
+            if self._action is not None:
+                self._action.tell(progress)
 
     def _publish(self, linear: float, angular: float) -> None:
         message = TwistStamped() if self._stamped else Twist()
@@ -248,27 +322,61 @@ class PolicyNode(Node):
 
     def stop(self) -> None:
         """Have the robot stand still."""
-        self._publish(0.0, 0.0)
+        if self.navigator is not None:
+            self._publish(0.0, 0.0)
+
+    def wait_for_listeners(self) -> None:
+        """Wait until the last order has arrived; it may be lost with its publisher."""
+        if self._commands is not None:
+            self._commands.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
+
+    def start(self) -> None:
+        """Configure and activate the node, as a manager of life cycles does."""
+        self.trigger_configure()
+        if self.failure is not None:
+            raise self.failure
+        self.trigger_activate()
+
+
+def end_on_signals() -> list[int]:
+    """Have signals end the program; the list holds those that came."""
+    came: list[int] = []
+
+    def end(number: int, _: Any) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    hangup = getattr(signal, "SIGHUP", None)
+    # A user who ignores the signal wants the node to outlive the terminal.
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signal.signal(hangup, end)
+    return came
 
 
 def main() -> None:
     """Run the node until it is shut down."""
     # The signal handlers of rclpy would end all publishing before the robot is stopped.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    hangup = getattr(signal, "SIGHUP", None)
-    # A user who ignores the signal wants the node to outlive the terminal.
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
-        signal.signal(hangup, signal.default_int_handler)
+    came = end_on_signals()
     node = PolicyNode()
     try:
-        rclpy.spin(node)
+        if node.get_parameter("autostart").value:
+            node.start()
+        # The compiler of the loops calls back, and hides what a signal raises then.
+        if not came:
+            rclpy.spin(node)
     except KeyboardInterrupt:
         pass
     finally:
+        # A second one, as from a terminal and from a launcher, must not come between.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         # If this fails nothing can be published, and the first error must be seen.
         with suppress(Exception):
             node.stop()
+            node.wait_for_listeners()
         node.destroy_node()
         rclpy.try_shutdown()
 

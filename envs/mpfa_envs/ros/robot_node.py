@@ -56,9 +56,15 @@ class RobotNode(Node):
     def _on_start(self, message: Any) -> None:
         place = message.pose.position
         self.robot.place((place.x, place.y, yaw(message.pose.orientation)))
+        # Whoever waits for it sees it there, though an order under way may move it at once.
+        self._tell()
 
     def _step(self) -> None:
         self.robot.step()
+        self._tell()
+
+    def _tell(self) -> None:
+        """Publish all that the robot measures."""
         stamp = rclpy.time.Time(nanoseconds=round(self.robot.time * 1e9)).to_msg()
         self._clock_topic.publish(Clock(clock=stamp))
         self._odometry.publish(self._odometry_message(stamp))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -63,14 +64,15 @@ class SimulatedRobot:
         self._field = first, last
         # Its rays go from left to right around its middle, those of a scan from right to left.
         view = math.degrees(last - first) * rays / (rays - 1)
-        self._lidar = Lidar(
-            self.world,
+        self._make_lidar = partial(
+            Lidar,
             sectors=rays,
             reduction="single",
             max_range=max_range,
             noise=noise,
             field_of_view=min(view, 360.0),
         )
+        self._lidar = self._make_lidar(self.world)
         self._timeout = check_positive("command_timeout", command_timeout)
         self._rng = np.random.default_rng(check_seed(seed))
         self._drives = make_drives(physics, self.robot, 1, time_step=self.time_step)
@@ -88,6 +90,10 @@ class SimulatedRobot:
         """True if its rim has met an obstacle since it was placed."""
         self._told = (0.0, 0.0)
         self._told_at = -math.inf
+
+    def become(self, world: World) -> None:
+        """Change the world around it, as where someone has walked on."""
+        self.world, self._lidar = world, self._make_lidar(world)
 
     @property
     def motion(self) -> Motion:

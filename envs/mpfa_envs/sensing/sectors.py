@@ -27,6 +27,8 @@ _NEAR = 0.08
 """Returns up to this beyond the least valid range may be too near for the next scan [m]."""
 _AROUND = np.radians(np.arange(-177.5, 180.0, 5.0))
 """Directions in which a scan is asked for rays [rad]."""
+_INSIDE = 0.03
+"""Rays that end so far within the robot's radius are not noise of an obstacle at its rim [m]."""
 _SUDDEN = 0.8
 """What is nearer than this share of the greatest range does not leave it from scan to scan."""
 _FARTHEST = MEANT["max_range"][1], 1e5
@@ -104,10 +106,8 @@ class Sectors:
         radius: float | None = None,
     ) -> None:
         self.card = card
-        rim = card.robot.radius if radius is None else check_positive("radius", radius)
-        *place, roll = (*check_mount("mount", mount, rim), 0.0)[:4]
-        self.mount = tuple(place)
-        self._side = 1.0 if abs(roll) < 1.0 else -1.0
+        self._rim = card.robot.radius if radius is None else check_positive("radius", radius)
+        self.mount_at(mount)
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
         self.silent: Silent = check_choice("silent", silent, Silent)
         self._edge = 0.5 * math.radians(card.field_of_view)
@@ -116,6 +116,12 @@ class Sectors:
         self._middles = self._edge - width * (np.arange(card.sectors) + 0.5)
         self._near: tuple[NDArray[np.float64], NDArray[np.float64]] = np.empty(0), np.empty(0)
         self._met = False
+
+    def mount_at(self, mount: tuple[float, ...]) -> None:
+        """Change the position of the sensor; arguments and errors as for the class."""
+        *place, roll = (*check_mount("mount", mount, self._rim), 0.0)[:4]
+        self.mount = tuple(place)
+        self._side = 1.0 if abs(roll) < 1.0 else -1.0
 
     def read(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
         """Read a scan.
@@ -174,6 +180,24 @@ class Sectors:
             np.concatenate((points.angles, silent)),
             np.concatenate((ranges, np.full(silent.size, math.nan))),
         )
+
+    def inside(self, scan: Scan) -> tuple[float, float] | None:
+        """Find the ray that ends deepest inside the robot, which is no obstacle then.
+
+        Args:
+            scan: What the lidar has measured.
+
+        Returns:
+            Direction of the ray in the scan [rad], and how far within the robot's radius it ends
+            [m]; None if none ends more than 3 cm within it.
+        """
+        rays, points, _, _ = self._measured(scan)
+        measured = np.flatnonzero(rays.valid)
+        depths = self._rim - points.ranges[: measured.size]
+        if not measured.size or depths.max() <= _INSIDE:
+            return None
+        ray = int(measured[depths.argmax()])
+        return float(scan.angle_min + ray * scan.angle_increment), float(depths.max())
 
     def blind(self, scan: Scan, turn: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Find the directions in which a scan does not look, ``unseen`` notwithstanding.

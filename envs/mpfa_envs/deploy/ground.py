@@ -1,0 +1,97 @@
+"""Where a goal lies: on the map that a robot makes, in the plan that it knows, or anywhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpfa_envs.checks import check_positive
+from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.deploy.card import Card
+    from mpfa_envs.sensing.sectors import Points
+    from mpfa_envs.worlds.world import World
+
+
+class Ground:
+    """A goal, and the map and the plan in which it lies; all in the frame of the odometry."""
+
+    def __init__(self, card: Card, map_size: float) -> None:
+        side = check_positive("map_size", map_size)
+        self._map_size = side if card.memory == "map" else None
+        # Its loops are compiled before the first decision is due.
+        self.map = MapPath(card) if card.memory == "map" else None
+        self.goal: tuple[float, float] | None = None
+        """The goal (x, y) [m]; None without."""
+        self.plan: Plan | None = None
+        self.is_new = True
+        """True until the first observation on the way to the goal."""
+        self._center: tuple[float, float] | None = None
+        self._begins = False
+
+    def begin(
+        self,
+        goal: tuple[float, float],
+        center: tuple[float, float] | None,  # of the map; None: where the robot is then
+        plan: World | None,
+        plan_pose: tuple[float, float, float],
+    ) -> None:
+        """Set out for a goal."""
+        center = None if center is None else pair_of("map_center", center)
+        goal = pair_of("goal", goal)
+        placed = None if plan is None else plan_at(plan, plan_pose)
+        if placed is not None:
+            placed.check(has_map=self.map is not None, center=center)
+            center = placed.middle
+        check_on_map(goal, center, placed, self._map_size)
+        self.goal, self.plan, self._center, self.is_new = goal, placed, center, True
+
+    def move_goal(self, goal: tuple[float, float]) -> None:
+        """Correct the goal."""
+        if (goal := pair_of("goal", goal)) != self.goal:
+            check_on_map(goal, self._center, self.plan, self._map_size)
+            self.goal = goal
+            if self.map is not None:
+                self.map.look_again()
+
+    def move_plan(self, pose: tuple[float, float, float]) -> None:
+        """Correct the pose of the plan; where walls come to other cells, the map begins again."""
+        if self.plan is None:
+            raise ValueError(f"plan must be given to begin() before it moves, got {pose}")
+        moved = plan_at(self.plan.world, pose)
+        if self.plan.is_off(moved.pose):
+            self.plan, self._center, self._begins = moved, moved.middle, True
+
+    def closes_in(self, radius: float, place: tuple[float, float]) -> bool:
+        """Return True if walls that are known keep a place from within a radius of the goal."""
+        if self.map is None or self.goal is None or self.is_new or self._begins:
+            return False
+        return self.map.closes_in(self.goal, radius, place)
+
+    def check_at(self, place: tuple[float, float]) -> None:
+        """Reject a goal that is not on the map of a robot at a place."""
+        if self.goal is not None:
+            check_on_map(self.goal, self._center or place, self.plan, self._map_size)
+
+    def path(
+        self,
+        pose: NDArray[np.float64],
+        taken: NDArray[np.float64],
+        points: Points,
+        *,
+        radius: float,  # of the goal [m]
+        place: tuple[float, float],  # of the robot; that of the map if it begins now
+    ) -> NDArray[np.float64]:
+        """Enter points taken at a pose; the path from another, ``[0, 3]`` or as that of the map."""
+        if self.map is None or self.goal is None:
+            return np.zeros((0, 3))
+        if self.is_new or self._begins:
+            self._center, self._begins = self._center or place, False
+            self.map.begin(self._center, sides_of(self.plan, self._map_size), self.plan)
+            if self.is_new and self.plan is not None:
+                self.map.reject_closed(self.goal, radius, place)
+        return self.map.sense(pose, taken, self.goal, points)
