@@ -201,7 +201,7 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
     def _write_in_turn(self, rows: NewRows) -> Tensor:
         """Write rows that fit the storage in the next slots, as TorchRL's writer does."""
         storage, writer, count = self._storage, self._writer, len(rows)
-        index = self._next_slots(count)
+        index = rows.slots
         rows.write(index, storage.max_size)
         writer._cursor = (writer._cursor + count) % storage.max_size
         writer._write_count += count
@@ -211,8 +211,9 @@ class CheckedReplayBuffer(TensorDictReplayBuffer):
 
     def _next_slots(self, count: int) -> Tensor:
         """Return the slots in which so many rows come in turn, shape ``[B]``."""
-        start = self._writer._cursor
-        return torch.arange(start, start + count, device="cpu") % self._storage.max_size
+        start, size = self._writer._cursor, self._storage.max_size
+        slots = torch.arange(start, start + count, device="cpu")
+        return slots if start + count <= size else slots % size
 
     def _prepare(self, data: TensorDictBase) -> tuple[NewRows | None, Tensor | None]:
         """Check transitions in the order of their slots.

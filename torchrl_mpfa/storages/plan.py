@@ -146,7 +146,7 @@ class RowPlan:
         entries = data._tensordict if slots is None else {**data._tensordict, INDEX_KEY: slots}
         if not _match(self._root.tree, entries, len(data), columns, values):
             return None
-        rows = NewRows(columns, values, len(data))
+        rows = NewRows(columns, values, len(data), slots)
         return None if rows.is_wrong() else rows
 
     def check(self, data: TensorDictBase, lead: int) -> None:
@@ -166,6 +166,7 @@ class NewRows:
     columns: array[int]
     values: list[Tensor]  # Kept until they are written.
     count: int
+    slots: Any  # The entry in which TorchRL's writers put the slot, if it was given.
 
     def __len__(self) -> int:
         return self.count

@@ -261,7 +261,7 @@ def test_the_highest_ever_is_an_option_and_stays(settings):
     buffer.extend(make_transitions(4))
     update(buffer, [0], [20.0])
     update(buffer, [0, 1], [0.5, 3.0])
-    assert buffer.sampler._max_priority == (20.0, 0)
+    assert buffer.sampler.default_priority == 20.0
     buffer.extend(make_transitions(4))
     assert buffer.sampler.priorities().tolist() == [20.0] * 4
 
