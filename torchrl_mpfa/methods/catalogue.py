@@ -7,9 +7,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.adjustment import Adjustment, Bound, Position, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
 from torchrl_mpfa.checks import BELOW_ONE, LEVEL, NOT_NEGATIVE, POSITIVE, SHARE, unknown
 from torchrl_mpfa.fusion import EntropyFusion, Fusion, ScaledFusion
 from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
@@ -30,13 +30,13 @@ class Adjusted(Prioritized):
     boost_target: float = within(BELOW_ONE, 0.0)
     """Share of the total priority that positive transitions are to have, by a phi that follows how
     rare they are in the buffer; 0: phi is fixed."""
-    boost_bound: Bound = one_of("floor", "cap", "none")
+    boost_bound: str = one_of("floor", "cap", "none")
     """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
     decay: bool = within(SWITCH, False)
     """Decay positive transitions above the batch mean, Eqs. 23-24."""
     decay_sharpness: float = within(POSITIVE, 0.01)
     """sigma of Eq. 23."""
-    decay_position: Position = one_of("batch", "rank", "count")
+    decay_position: str = one_of("batch", "rank", "count")
     """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
     positive_above: Any = field(default=0.0, metadata={"rule": LEVEL})
     """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
@@ -46,9 +46,11 @@ class Adjusted(Prioritized):
         """Make the boost and the decay that are on."""
         parts: list[Adjustment] = []
         if self.boost:
-            parts.append(PositiveBoost(self.boost_factor, self.boost_bound, self.boost_target))
+            bound: Any = self.boost_bound  # Hydra knows no literal types.
+            parts.append(PositiveBoost(self.boost_factor, bound, self.boost_target))
         if self.decay:
-            parts.append(PositiveDecay(self.decay_sharpness, self.decay_position))
+            position: Any = self.decay_position
+            parts.append(PositiveDecay(self.decay_sharpness, position))
         return parts
 
 
@@ -63,12 +65,13 @@ class MPFA(Adjusted):
     weight_floor: float = within(BELOW_ONE, 0.0)
     """Least weight of a signal: without one the reward alone counts until the first goal; 0: none,
     as in the paper."""
-    population: Literal["buffer", "batch"] = one_of("buffer", "batch")
+    population: str = one_of("buffer", "batch")
     """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
 
     def fusion(self) -> Fusion:
         """Make the fusion by entropy weights."""
-        return EntropyFusion(population=self.population, floor=self.weight_floor)
+        population: Any = self.population
+        return EntropyFusion(population=population, floor=self.weight_floor)
 
 
 @dataclass
@@ -78,7 +81,7 @@ class Scaled(Adjusted):
     name: str = "mpfa_plus"
     signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
     # Signals are in units of their means, of which a floor of 1 is not one.
-    boost_bound: Bound = "none"
+    boost_bound: str = "none"
     # More than a step can bring, and less than a goal.
     positive_above: Any = 1.0
 
