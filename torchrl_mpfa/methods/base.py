@@ -192,7 +192,7 @@ class Prioritized(Method):
         """Return the signals of the priority; an unknown name is a signal of the loss."""
         from torchrl_mpfa.signals import as_signals
 
-        return [*as_signals(self.signals)]
+        return [*as_signals(self.signals)] if self.signals else []
 
     def fusion(self) -> Fusion:
         """Make the fusion of the signals."""
