@@ -103,7 +103,7 @@ def mpfa_envs_version() -> str:
 
 @pytest.mark.parametrize("file", sorted((FOLDER / "launch").glob("*.yaml")), ids=lambda f: f.stem)
 def test_parameter_files_fit_the_node_and_the_shipped_policies(file: Path) -> None:
-    values = yaml.safe_load(file.read_text(encoding="utf-8"))["mpfa_policy"]["ros__parameters"]
+    values = yaml.safe_load(file.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     known = parameters("policy_node.py")
     assert {name: type(value) for name, value in values.items()} == {
         name: type(known[name]) for name in values

@@ -161,7 +161,8 @@ class PolicyNode(LifecycleNode):
             return
         try:
             kind = self._action_type()
-        except ImportError:
+        except ImportError as error:
+            self.get_logger().warning(f"no action is served: {error}")
             return
         self._action = NavigateAction(
             self,
@@ -177,10 +178,12 @@ class PolicyNode(LifecycleNode):
         """The transforms between frames, where tf2 is installed."""
         try:
             from tf2_ros import Buffer, TransformListener
-        except ImportError:
+        except ImportError as error:
+            self.get_logger().warning(f"no transforms are read, and `mount` counts: {error}")
             return None
         buffer = Buffer()
-        self._listener = TransformListener(buffer, self)
+        # The node would hold on to it.
+        self._undo.append(TransformListener(buffer, self).unregister)
         return lambda target, source: buffer.lookup_transform(target, source, Time())
 
     def _clean_up(self) -> None:
@@ -188,7 +191,6 @@ class PolicyNode(LifecycleNode):
         while self._undo:
             self._undo.pop()()
         self.navigator = self._action = self._commands = None
-        self._listener = None
 
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) * 1e-9
