@@ -54,7 +54,8 @@ def run_updates(
 
     Raises:
         ValueError: If ``updates`` is not positive, or the buffer has no batch size or fewer
-            transitions than one batch; nothing is changed.
+            transitions than one batch; nothing is changed. Or, after the updates, if none of them
+            had a batch for the critic.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -17,24 +17,12 @@ pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the node
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 pytest.importorskip("ros2launch", reason="ros2 run and ros2 launch are not in the Python index")
 
-import rclpy
 
 from mpfa_envs import export_policy, load_policy
-from tests.ros.live import choose_domain
 from tests.ros.processes import Bench
 from tests.ros.test_launch import places_in_a_prefix
 
 pytestmark = pytest.mark.filterwarnings("ignore")
-
-
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    choose_domain()
-    rclpy.init()
-    found = Bench()
-    yield found
-    found.node.destroy_node()
-    rclpy.shutdown()
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,29 +13,17 @@ import pytest
 pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the nodes were not run")
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
 from mpfa_envs import evaluate, export_policy, load_policy, world_tasks
 from tests.envs.exported import SHIPPED
-from tests.ros.live import choose_domain
 from tests.ros.processes import SECONDS, Bench, node
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 _SPEED = 3.0
 """Of the simulated robot, over real time."""
-
-
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    choose_domain()
-    rclpy.init()
-    found = Bench()
-    yield found
-    found.node.destroy_node()
-    rclpy.shutdown()
 
 
 @pytest.fixture

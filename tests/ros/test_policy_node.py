@@ -37,6 +37,9 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
 
+LAUNCH = Path(policy_node.__file__).parent / "launch"
+
+
 class MetersAhead:
     """An action whose goal is a number of meters, in the place of NavigateToPose."""
 
@@ -367,3 +370,18 @@ def test_a_signal_ends_a_node_that_no_one_has_configured(number: signal.Signals)
         assert found.until(answers, 60.0)
         process.send_signal(number)
         assert process.wait(10.0) == 0
+
+
+@pytest.mark.parametrize("file", sorted(LAUNCH.glob("*.yaml")), ids=lambda file: file.stem)
+def test_a_file_of_parameters_reaches_a_node_in_the_namespace_of_a_robot(file: Path) -> None:
+    context = rclpy.Context()
+    words = ["--ros-args", "--params-file", str(file), "-r", "__ns:=/robot1"]
+    rclpy.init(args=words, context=context)
+    name = "mpfa_policy"
+    found = rclpy.create_node(
+        name, context=context, automatically_declare_parameters_from_overrides=True
+    )
+    assert found.get_parameter("robot").value == file.stem.replace("turtlebot3_", "")
+    assert found.get_parameter("clearance").value > 0.0
+    found.destroy_node()
+    rclpy.shutdown(context=context)

@@ -238,7 +238,7 @@ class SignalSampler(TreeSampler):
         """Check transitions that are about to be written; nothing is changed.
 
         Returns:
-            Their rows of the table, shape ``[count, K + 3]``.
+            Their rows of the table, shape ``[count, C]``.
 
         Raises:
             KeyError: If a reward or signal that is known at the write is missing.

@@ -224,7 +224,7 @@ class ReadTree:
 
 
 class HasTrees:
-    """A sampler that has trees, which TorchRL's methods find by their own names."""
+    """A sampler whose trees scripts read by TorchRL's own names."""
 
     trees: Any
 
