@@ -175,6 +175,7 @@ MESSAGES = {
         (
             {"rclpy", *MESSAGES},
             {
+                "envs/mpfa_envs/ros/declared.py",
                 "envs/mpfa_envs/ros/navigate_action.py",
                 "envs/mpfa_envs/ros/policy_node.py",
                 "envs/mpfa_envs/ros/robot_node.py",

@@ -322,6 +322,37 @@ def test_the_lidar_is_where_its_frame_is(
     assert (sectors._side < 0.0) == (roll > 0.0)
 
 
+def test_the_body_is_the_frame_of_the_odometry_unless_it_is_named(tmp_path: Path) -> None:
+    rig, asked = Rig(straight(tmp_path)), []
+    rig.transform = transform(0.0, x=0.02)
+    rig.navigator.frames._lookup = lambda *frames: asked.append(frames) or rig.look_up(*frames)
+    rig.navigator.see(scan(10.0), 10.0)
+    assert asked == [] and "by the parameter mount" in rig.navigator.lidar
+    message = odometry(10.1)
+    message.child_frame_id = "base_footprint"
+    rig.navigator.feel(message, 10.1)
+    rig.navigator.see(scan(10.1), 10.1)
+    assert asked == [("base_footprint", "laser")]
+    assert rig.navigator.lidar == (
+        "lidar at (0.020, 0.000) m, looks to 0 degrees, by tf2: 'laser' in 'base_footprint'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("learned_behind_it", "clearance", "kept"),
+    [(True, -1.0, 0.03), (True, 0.0, None), (True, 0.1, 0.1), (False, -1.0, None)],
+)
+def test_the_filter_is_there_where_the_policy_needs_it_unless_it_is_switched_off(
+    tmp_path: Path, learned_behind_it: bool, clearance: float, kept: float | None
+) -> None:
+    layer = Linear(np.zeros((2, 42), np.float32), np.ones(2, np.float32))
+    robot = {"robot": "kobuki", "physics": "kinematic"}
+    policy = Policy([layer], card={"filter": learned_behind_it}, env_arguments=robot)
+    file = str(export_policy(policy, tmp_path / "policy.onnx"))
+    keep = Rig(file, clearance=clearance).navigator.controller.pilot._keep
+    assert (None if keep is None else keep.body.clearance) == kept
+
+
 def test_a_lidar_outside_of_the_robot_is_an_error(tmp_path: Path) -> None:
     rig = Rig(straight(tmp_path), base="base_link")
     rig.transform = transform(0.0, x=3.0)

@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", reason="no rclpy (extra ros, Python 3.11): the node
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import rclpy
+from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
@@ -51,8 +52,10 @@ class MetersAhead:
         message.pose.position.x, message.pose.orientation.w = float(goal.order), 1.0
         return message
 
-    def feedback(self, progress: Any) -> Any:
-        return Fibonacci.Feedback(sequence=[round(progress.distance), progress.recoveries])
+    def feedback(self, progress: Any, place: Any) -> Any:
+        assert place.header.frame_id == "odom"
+        x = round(place.pose.position.x)
+        return Fibonacci.Feedback(sequence=[round(progress.distance), progress.recoveries, x])
 
     def result(self, status: Any) -> Any:
         return Fibonacci.Result(sequence=[len(status.reason)])
@@ -139,6 +142,7 @@ def test_the_action_succeeds_with_feedback(started: Live) -> None:
     assert ended.result().status == SUCCEEDED
     assert list(ended.result().result.sequence) == [len("arrived")]
     assert [message.feedback.sequence[0] for message in heard][-1] <= 1 and len(heard) >= 2
+    assert [message.feedback.sequence[2] for message in heard][-1] >= 1
 
 
 def test_the_action_is_canceled_by_its_client(started: Live) -> None:
@@ -158,6 +162,30 @@ def test_another_goal_aborts_that_of_the_action_and_is_driven(started: Live) -> 
     assert started.until(ended.done) and ended.result().status == ABORTED
     ended = second.get_result_async()
     assert started.until(ended.done) and ended.result().status == SUCCEEDED
+
+
+@pytest.mark.parametrize("end", ["trigger_shutdown", "end"])
+def test_the_client_of_the_action_gets_its_result_when_the_node_ends(
+    started: Live, end: str
+) -> None:
+    handle, _ = send(started, 5)
+    ended = handle.get_result_async()
+    assert started.until(lambda: started.around.states[-1] == "driving")
+    getattr(started.node, end)()
+    assert started.until(ended.done, 5.0) and ended.result().status == ABORTED
+    assert started.until(lambda: started.around.sent[-1] == (0.0, 0.0))
+    if end == "trigger_shutdown":
+        assert started.until(lambda: started.node.navigator is None, 5.0)
+
+
+def test_a_node_that_does_not_drive_says_nothing_at_its_end(started: Live) -> None:
+    around = started.around
+    started.node.trigger_deactivate()
+    assert started.until(lambda: bool(around.sent))
+    sent = len(around.sent)
+    started.node.end()
+    started.until(lambda: False, 0.5)
+    assert len(around.sent) == sent
 
 
 def test_an_action_of_an_inactive_node_is_rejected(started: Live) -> None:
@@ -260,6 +288,53 @@ def test_a_check_that_fails_stops_the_robot_and_is_said(
     assert started.until(lambda: around.states[-1] == "given up")
     around.aim(5.0)
     assert started.until(lambda: around.sent[-1][0] > 0.1)
+
+
+def test_whole_numbers_and_no_text_are_parameters_too(tmp_path: Path) -> None:
+    given = {"clearance": 0, "rate": 10, "mount": "[0, 0, 0]", "action": "none", "pace": 1}
+    with live(lambda: PolicyNode(MetersAhead), policy=turning(tmp_path), **given) as found:
+        found.node.start()
+        controller = found.node.navigator.controller
+        assert not controller.pilot.has_filter and controller.check_period == 0.1
+        assert found.node._action is None
+        request = SetParameters.Request(parameters=[parameter("scan_timeout", 1)])
+        found.call(SetParameters, "mpfa_policy/set_parameters", request)
+        assert controller.scan_timeout == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wants"),
+    [("stamped", 1, "true or false"), ("rate", "fast", "a number"), ("mount", 0.1, "a list")],
+)
+def test_a_parameter_of_another_type_is_rejected_by_name(
+    tmp_path: Path, name: str, value: Any, wants: str
+) -> None:
+    with (
+        live(PolicyNode, policy=straight(tmp_path), **{name: value}) as found,
+        pytest.raises(ValueError, match=rf"{name} must be {wants}.*, got"),
+    ):
+        found.node.start()
+
+
+def test_the_status_says_that_no_one_takes_the_orders(tmp_path: Path) -> None:
+    with live(PolicyNode, policy=straight(tmp_path), command_topic="elsewhere") as found:
+        found.node.start()
+        assert found.until(lambda: found.node.navigator.frames.odometry is not None)
+        found.around.aim(5.0)
+
+        def notes() -> list[str]:
+            return [status["note"] for status in found.around.statuses]
+
+        assert found.until(lambda: "no one subscribes to /elsewhere" in notes(), 10.0)
+        # A process of its own: in one, all have the same type.
+        context = rclpy.Context()
+        rclpy.init(context=context)
+        base = rclpy.create_node("base", context=context)
+        base.create_subscription(TwistStamped, "elsewhere", lambda _: None, 1)
+        note = "/elsewhere is subscribed as TwistStamped: set stamped true"
+        assert found.until(lambda: note in notes(), 10.0)
+        base.destroy_node()
+        rclpy.shutdown(context=context)
 
 
 @pytest.fixture

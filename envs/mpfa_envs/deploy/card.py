@@ -101,6 +101,11 @@ class Card:
     training: Mapping[str, Any]
     """Facts about its training."""
 
+    @property
+    def needs_filter(self) -> bool:
+        """True if it learned behind a filter, and never what a collision costs."""
+        return bool(self.training.get("filter", False))
+
     def __post_init__(self) -> None:
         # A compiled loop writes as many numbers as the parts have.
         if self.action_size != 2:

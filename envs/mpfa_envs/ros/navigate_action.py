@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from mpfa_envs.ros.navigator import Progress
     from mpfa_envs.ros.status import Status
 
-UNREACHABLE: Final = 1
-"""``error_code`` of a goal that was rejected,"""
-GIVEN_UP: Final = 2
-"""and of one that was given up; 0 is none."""
+UNREACHABLE: Final = 208
+"""``error_code`` of a goal that was rejected, ``NO_VALID_PATH`` of Nav2's planners,"""
+GIVEN_UP: Final = 105
+"""and of one that was given up, ``FAILED_TO_MAKE_PROGRESS`` of its controllers; 0 is none."""
 
 
 class ActionType(Protocol):
@@ -31,8 +31,8 @@ class ActionType(Protocol):
     def place(self, goal: Any) -> Any:
         """The ``geometry_msgs/PoseStamped`` of a goal."""
 
-    def feedback(self, progress: Progress) -> Any:
-        """A feedback message."""
+    def feedback(self, progress: Progress, place: Any) -> Any:
+        """A feedback message; the place is a ``geometry_msgs/PoseStamped``."""
 
     def result(self, status: Status) -> Any:
         """A result message."""
@@ -50,9 +50,10 @@ class NavigateToPose:
         """The ``geometry_msgs/PoseStamped`` of a goal."""
         return goal.pose
 
-    def feedback(self, progress: Progress) -> Any:
-        """A feedback message."""
+    def feedback(self, progress: Progress, place: Any) -> Any:
+        """A feedback message; the place is a ``geometry_msgs/PoseStamped``."""
         message = self.kind.Feedback()
+        message.current_pose = place
         message.distance_remaining = 0.0 if math.isnan(progress.distance) else progress.distance
         message.navigation_time = Duration(seconds=progress.time).to_msg()
         message.number_of_recoveries = progress.recoveries
@@ -86,6 +87,7 @@ class NavigateAction:
         self._kind, self._begin, self._cancel = kind, begin, cancel
         self._handle: Any = None
         self._ended: Any = None
+        self._executing = 0
         self._server = ActionServer(
             node,
             kind.kind,
@@ -101,10 +103,15 @@ class NavigateAction:
         """True while a goal of the action is under way."""
         return self._ended is not None
 
-    def tell(self, progress: Progress) -> None:
-        """Publish how far the drive has come."""
+    @property
+    def is_open(self) -> bool:
+        """True until the client of each goal has its result."""
+        return self._executing > 0
+
+    def tell(self, progress: Progress, place: Any) -> None:
+        """Publish how far the drive has come, and where the robot is."""
         if self.is_active and self._handle.is_active:
-            self._handle.publish_feedback(self._kind.feedback(progress))
+            self._handle.publish_feedback(self._kind.feedback(progress, place))
 
     def end(self, status: Status) -> None:
         """End the goal of the action, if there is one, by what has become of it."""
@@ -120,6 +127,7 @@ class NavigateAction:
         # This ends the goal before, as a goal of the topic does.
         self._begin(self._kind.place(handle.request))
         self._handle, self._ended = handle, Future()
+        self._executing += 1
         handle.execute(partial(self._execute, self._ended))
 
     def _on_cancel(self, handle: Any) -> Any:
@@ -130,6 +138,8 @@ class NavigateAction:
     async def _execute(self, ended: Any, handle: Any) -> Any:
         """Wait for the end of the drive; by then a cancel has reached the handle."""
         status = await ended
+        # The result is sent in the same step of the executor.
+        self._executing -= 1
         if handle.is_cancel_requested:
             handle.canceled()
         elif status.state == "arrived":

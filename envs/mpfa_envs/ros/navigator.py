@@ -37,14 +37,15 @@ class Navigator:
         trust_stamps: bool = True,  # False: what a message says is of the time when it came
         turns: bool = True,  # to the heading of a goal, where the robot can
         transform_timeout: float = 1.0,  # oldest transform by which it drives [s]
-        base: str = "",  # frame of the robot, in which tf2 knows the lidar; empty: it is not asked
+        base: str = "",  # frame of the robot's body; empty: the one whose pose is the odometry's
     ) -> None:
         self.controller, self.frames = controller, frames
         self._trust_stamps, self._transform_timeout = trust_stamps, transform_timeout
         self._turns = turns and controller.pilot.turns_on_the_spot
         self._goal: tuple[Pose, str] | None = None
         self._plan: tuple[World, Pose, str] | None = None
-        self._base, self._sensor = base, ""
+        self.base_frame, self._sensor = base, ""
+        """The frame of the robot's body; empty before the first odometry."""
         self._waits = ""
         self._felt, self._known_since, self._since = -math.inf, -math.inf, 0.0
         self.pose: Pose | None = None
@@ -65,6 +66,16 @@ class Navigator:
         """Why the place of the goal is not known yet; empty if it is."""
         return self._waits
 
+    @property
+    def lidar(self) -> str:
+        """Where the lidar is mounted, and who says so."""
+        x, y, direction = self.controller.pilot.sectors.mount
+        source = "the parameter mount or the robot's file"
+        if self._sensor:
+            source = f"tf2: {self._sensor!r} in {self.base_frame!r}"
+        degrees = math.degrees(direction)
+        return f"lidar at ({x:.3f}, {y:.3f}) m, looks to {degrees:.0f} degrees, by {source}"
+
     def see(self, message: Any, now: float) -> None:
         """Take a ``sensor_msgs/LaserScan``."""
         self._find_lidar(message.header.frame_id)
@@ -78,6 +89,7 @@ class Navigator:
             self._forget_goal()
             reason = f"odometry jumped: from frame {last!r} to {frame!r}"
             self.controller.aim(None, reason, state="given up")
+        self.base_frame = self.base_frame or getattr(message, "child_frame_id", "")
         pose, speeds = odometry_of(message)
         self.pose, self._felt = pose, self._time_of(message.header, now)
         self.controller.feel(pose, speeds, self._felt)
@@ -127,8 +139,8 @@ class Navigator:
 
     def _find_lidar(self, sensor: str) -> None:
         """Mount the lidar where tf2 has it, once; a place outside of the robot is an error."""
-        if self._base and sensor != self._sensor:
-            mount = self.frames.mount(sensor, self._base)
+        if self.base_frame and sensor != self._sensor:
+            mount = self.frames.mount(sensor, self.base_frame)
             if mount is not None:
                 self.controller.pilot.sectors.mount_at(mount)
                 self._sensor = sensor

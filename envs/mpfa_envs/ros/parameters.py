@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mpfa_envs.checks import check_not_negative, check_positive
 from mpfa_envs.deploy import Pilot
+from mpfa_envs.deploy.card import Network, read_exported
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.rehearsal import rehearse
+from mpfa_envs.safety.filter import CLEARANCE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from mpfa_envs.deploy.card import Card
 
 PARAMETERS: Final[dict[str, Any]] = {
     "policy": "",
@@ -21,7 +24,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "unseen": 0.0,
     "silent": "reject",
     "map_size": 40.0,
-    "clearance": 0.0,
+    "clearance": -1.0,
     "latency": -1.0,
     "goal_radius": 0.0,
     "goal_heading": True,
@@ -32,7 +35,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "rate": 20.0,
     "trust_stamps": True,
     "stamped": False,
-    "base_frame": "base_link",
+    "base_frame": "",
     "scan_topic": "scan",
     "odometry_topic": "odom",
     "goal_topic": "goal_pose",
@@ -48,27 +51,34 @@ LIVE: Final = ("clearance", "goal_radius", "scan_timeout")
 
 def make_controller(value: Callable[[str], Any]) -> Controller:
     """Make the controller of a node's parameters; all loops are compiled then."""
-    load = partial(
-        Pilot.load,
-        value("policy"),
+    card, content = read_exported(value("policy"))
+    options = dict(
         robot=value("robot") or None,
         pace=value("pace") or None,
         mount=tuple(value("mount")) if any(value("mount")) else None,
         unseen=value("unseen") or None,
         silent=value("silent"),
         map_size=value("map_size"),
-        clearance=value("clearance") or None,
+        clearance=_clearance(value("clearance"), card),
         latency=None if value("latency") < 0.0 else value("latency"),
         goal_radius=value("goal_radius") or None,
     )
+    networks = (Network(content, card.observation_size, card.action_size) for _ in range(2))
+    rehearsing, pilot = (Pilot(card, network, **options) for network in networks)
     # Loops that the first decision compiled would hold up the checks for seconds.
-    rehearse(load())
-    pilot = load()
+    rehearse(rehearsing)
     limits = {name: value(name) for name in ("stop_distance", "scan_timeout", "odometry_timeout")}
     rate = check_positive("rate", value("rate"))
     if (topic := value("map_topic")) and pilot.card.memory != "map":
         raise ValueError(f"map_topic must be '' for a policy without a map, got {topic!r}")
     return Controller(pilot, **limits, check_period=1.0 / rate)
+
+
+def _clearance(clearance: float, card: Card) -> float | None:
+    """What the filter keeps [m]; None: no filter. A negative number is what the policy needs."""
+    if clearance < 0.0:
+        return CLEARANCE if card.needs_filter else None
+    return clearance or None
 
 
 def check_change(changes: Mapping[str, Any], controller: Controller) -> None:

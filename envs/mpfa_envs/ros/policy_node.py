@@ -27,8 +27,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from mpfa_envs.checks import check_positive
+from mpfa_envs.ros.declared import checked, declare, value_of
 from mpfa_envs.ros.frames import Frames
-from mpfa_envs.ros.messages import seconds, yaw
+from mpfa_envs.ros.messages import seconds, write_pose, yaw
 from mpfa_envs.ros.navigate_action import ActionType, NavigateAction, NavigateToPose
 from mpfa_envs.ros.navigator import Navigator
 from mpfa_envs.ros.parameters import PARAMETERS, change, check_change, make_controller
@@ -47,6 +48,8 @@ _FROZEN: Final = 0.5
 """Time for which the clock may stand still while the robot drives [s]."""
 _ACKNOWLEDGED: Final = 0.5
 """Longest time that the node waits at its end for those who have not yet got its last order [s]."""
+_LISTENED: Final = 1.0
+"""Time from one look at who takes the orders to the next [s]."""
 _LATCHED: Final = {"depth": 1, "durability": DurabilityPolicy.TRANSIENT_LOCAL}
 
 
@@ -55,8 +58,7 @@ class PolicyNode(LifecycleNode):
 
     def __init__(self, action: Callable[[], ActionType] = NavigateToPose) -> None:
         super().__init__("mpfa_policy")
-        for name, default in PARAMETERS.items():
-            self.declare_parameter(name, default)
+        declare(self, PARAMETERS)
         self._action_type = action
         self.failure: Exception | None = None
         """Why it could not be configured."""
@@ -68,6 +70,7 @@ class PolicyNode(LifecycleNode):
         self._commands: Any = None
         self._undo: list[Callable[[], Any]] = []
         self._goals, self._reason, self._told_at = 0, "", -1.0
+        self._lidar, self._unheard, self._listened_at = "", "", -1.0
         self._kind: tuple[Any, ...] = ()
         # A clock of a simulator may stop, and with it all that counts its time.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -78,6 +81,8 @@ class PolicyNode(LifecycleNode):
 
     def on_configure(self, state: Any) -> TransitionCallbackReturn:
         """Load the policy and open the topics; it fails if a parameter does not fit."""
+        # A node that was shut down closes a moment later.
+        self._clean_up()
         try:
             self._configure()
         # Whatever it is: rclpy would hide it.
@@ -105,9 +110,11 @@ class PolicyNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
-        """Stand, whatever the node does."""
+        """Stand, whatever the node does, and close the topics."""
         self._halt("the node was shut down")
-        self._clean_up()
+        # The client of the action has to hear of its end before.
+        closing = self.create_timer(_ACKNOWLEDGED, self._clean_up, clock=self._steady)
+        self._undo.append(partial(self.destroy_timer, closing))
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: Any) -> TransitionCallbackReturn:
@@ -115,7 +122,7 @@ class PolicyNode(LifecycleNode):
         return self.on_shutdown(state)
 
     def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
+        return value_of(self, name, PARAMETERS)
 
     def _configure(self) -> None:
         value = self._value
@@ -130,7 +137,7 @@ class PolicyNode(LifecycleNode):
             transform_timeout=timeout,
             base=value("base_frame"),
         )
-        self._stamped, self._base_frame = value("stamped"), value("base_frame")
+        self._stamped = value("stamped")
         kind = TwistStamped if self._stamped else Twist
         self._commands = self._publish_on(kind, value("command_topic"), 1)
         self._statuses = self._publish_on(DiagnosticStatus, "~/status", QoSProfile(**_LATCHED))
@@ -145,6 +152,10 @@ class PolicyNode(LifecycleNode):
         checks = self.create_timer(1.0 / value("rate"), self._tick)
         self._undo.append(partial(self.destroy_timer, checks))
         self._serve_action()
+        if controller.pilot.card.needs_filter and not controller.pilot.has_filter:
+            self.get_logger().warning(
+                "clearance is 0: the policy learned behind the filter, and touches things without"
+            )
 
     def _publish_on(self, kind: Any, topic: str, quality: Any) -> Any:
         publisher = self.create_publisher(kind, topic, quality)
@@ -196,13 +207,17 @@ class PolicyNode(LifecycleNode):
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
     def _on_parameters(self, parameters: Any) -> SetParametersResult:
-        changes = {each.name: each.value for each in parameters}
-        if self.navigator is not None:
-            try:
+        try:
+            changes = {
+                each.name: checked(each.name, each.value, PARAMETERS[each.name])
+                for each in parameters
+                if each.name in PARAMETERS
+            }
+            if self.navigator is not None:
                 check_change(changes, self.navigator.controller)
                 change(changes, self.navigator.controller)
-            except ValueError as error:
-                return SetParametersResult(successful=False, reason=str(error))
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _on_scan(self, message: Any) -> None:
@@ -212,6 +227,9 @@ class PolicyNode(LifecycleNode):
             except ValueError as error:
                 # The last scan grows old, which stops the robot.
                 self.get_logger().error(f"scan: {error}", throttle_duration_sec=5.0)
+            if self.navigator.lidar != self._lidar:
+                self._lidar = self.navigator.lidar
+                self.get_logger().info(self._lidar)
             self._tick()
 
     def _on_odometry(self, message: Any) -> None:
@@ -244,10 +262,12 @@ class PolicyNode(LifecycleNode):
 
     def _halt(self, reason: str) -> None:
         """Give up the goal, stand, and take none."""
-        if self.navigator is not None:
+        try:
             self._cancel(reason)
-            self.stop()
-        self.is_driving = False
+        finally:
+            if self.is_driving:
+                self.stop()
+            self.is_driving = False
 
     def _watch(self) -> None:
         """Stop a driving robot where the clock stands still."""
@@ -297,7 +317,8 @@ class PolicyNode(LifecycleNode):
         frozen = self._frozen if navigator.is_active else ""
         reason = frozen or navigator.waits or self._reason
         state: State = "waiting" if frozen else navigator.state
-        status = Status(state, reason, navigator.controller.note(now), self._goals)
+        note = self._missing_listener(now) or navigator.controller.note(now)
+        status = Status(state, reason, note, self._goals)
         if status.kind != self._kind:
             self._kind = status.kind
             message = status.message(self.get_name())
@@ -310,14 +331,40 @@ class PolicyNode(LifecycleNode):
             progress = navigator.progress(now)
             self._feedbacks.publish(feedback(progress))
             if self._action is not None:
-                self._action.tell(progress)
+                self._action.tell(progress, self._place(navigator))
+
+    def _missing_listener(self, now: float) -> str:
+        """What is to be said where no one takes the orders; empty if someone does, or must not."""
+        if self.navigator is None or not self.navigator.is_active:
+            return ""
+        if not 0.0 <= now - self._listened_at < _LISTENED:
+            topic, self._listened_at = self._commands.topic_name, now
+            heard = self.get_subscriptions_info_by_topic(topic)
+            kinds = {each.topic_type.rpartition("/")[2] for each in heard}
+            mine = TwistStamped if self._stamped else Twist
+            self._unheard = ""
+            if not kinds:
+                self._unheard = f"no one subscribes to {topic}"
+            elif mine.__name__ not in kinds:
+                other = str(not self._stamped).lower()
+                self._unheard = f"{topic} is subscribed as {sorted(kinds)[0]}: set stamped {other}"
+        return self._unheard
+
+    def _place(self, navigator: Navigator) -> Any:
+        """Where the robot is, as a message."""
+        message = PoseStamped()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = navigator.frames.odometry or ""
+        if navigator.pose is not None:
+            write_pose(message.pose, navigator.pose)
+        return message
 
     def _publish(self, linear: float, angular: float) -> None:
         message = TwistStamped() if self._stamped else Twist()
         twist = message
         if self._stamped:
             message.header.stamp = self.get_clock().now().to_msg()
-            message.header.frame_id = self._base_frame
+            message.header.frame_id = self._body_frame()
             twist = message.twist
         twist.linear.x, twist.angular.z = float(linear), float(angular)
         self._commands.publish(message)
@@ -326,6 +373,19 @@ class PolicyNode(LifecycleNode):
         """Have the robot stand still."""
         if self.navigator is not None:
             self._publish(0.0, 0.0)
+
+    def _body_frame(self) -> str:
+        """The frame of the robot's body, in which speeds are."""
+        return (self.navigator and self.navigator.base_frame) or "base_link"
+
+    def end(self) -> None:
+        """Give up the goal, stand, and wait until those who wait for it have heard it."""
+        action = self._action
+        self._halt("the node has ended")
+        until = self._steady.now() + Duration(seconds=_ACKNOWLEDGED)
+        while action is not None and action.is_open and self._steady.now() < until:
+            rclpy.spin_once(self, timeout_sec=0.02)
+        self.wait_for_listeners()
 
     def wait_for_listeners(self) -> None:
         """Wait until the last order has arrived; it may be lost with its publisher."""
@@ -377,8 +437,7 @@ def main() -> None:
             signal.signal(number, signal.SIG_IGN)
         # If this fails nothing can be published, and the first error must be seen.
         with suppress(Exception):
-            node.stop()
-            node.wait_for_listeners()
+            node.end()
         node.destroy_node()
         rclpy.try_shutdown()
 

@@ -16,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
+from mpfa_envs.ros.declared import declare, value_of
 from mpfa_envs.ros.messages import write_pose, yaw
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 
@@ -37,9 +38,8 @@ class RobotNode(Node):
 
     def __init__(self) -> None:
         super().__init__("mpfa_robot")
-        for name, default in PARAMETERS.items():
-            self.declare_parameter(name, default)
-        values = {name: self.get_parameter(name).value for name in PARAMETERS}
+        declare(self, PARAMETERS)
+        values = {name: value_of(self, name, PARAMETERS) for name in PARAMETERS}
         speed = values.pop("speed")
         self.robot = SimulatedRobot(values.pop("world"), **values)
         self._clock_topic = self.create_publisher(Clock, "/clock", 10)
@@ -83,7 +83,7 @@ class RobotNode(Node):
     def _scan_message(self, stamp: Any) -> Any:
         scan, message = self.robot.scan(), LaserScan()
         message.header.stamp = stamp
-        message.header.frame_id = "base_link"
+        message.header.frame_id = "laser"
         message.angle_min, message.angle_increment = scan.angle_min, scan.angle_increment
         message.ranges = array("f", np.asarray(scan.ranges, dtype=np.float64))
         message.angle_max = scan.angle_min + scan.angle_increment * (len(message.ranges) - 1)
