@@ -123,7 +123,10 @@ def test_a_team_with_autoreset_is_rejected():
         ({"tasks": facing(), "reset_mask": np.array([True, False])}, "all robots of a team"),
         ({"tasks": facing(), "worlds": [HALL, World(name="other", size=(8.0, 8.0))]}, "one world"),
         (
-            {"tasks": facing(), "worlds": [World(name="w", size=(8.0, 8.0), walkers=(Walker(),))] * 2},
+            {
+                "tasks": facing(),
+                "worlds": [World(name="w", size=(8.0, 8.0), walkers=(Walker(),))] * 2,
+            },
             "must have no walkers",
         ),
     ],

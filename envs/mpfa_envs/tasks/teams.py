@@ -30,8 +30,10 @@ _ATTEMPTS: Final = 1000
 _STREAM: Final = 82
 """Apart from the random numbers of other tasks with the same seed."""
 
-_ENDS = (Box(-6.5, -2.5, -4.0, 2.5), Box(4.0, -2.5, 6.5, 2.5))
+_STARTS = (Box(-6.5, -2.5, -4.0, 2.5), Box(4.0, -2.5, 6.5, 2.5))
 """Where robots start in worlds with two halls; they drive to the other one."""
+_GOALS = (Box(-6.5, -2.5, -4.8, 2.5), Box(4.8, -2.5, 6.5, 2.5))
+"""Where their goals lie: who has arrived leaves room at the end of a lane."""
 
 
 def _halls(name: str, *boxes: Box) -> World:
@@ -107,10 +109,7 @@ def team_tasks(
     check_count("episodes", episodes)
     check_seed(seed)
     radius = resolve_robot(robot).radius
-    if name in TEAM_WORLDS:
-        worlds = [TEAM_WORLDS[name]] * episodes
-    else:
-        worlds = _generated(name, episodes)
+    worlds = [TEAM_WORLDS[name]] * episodes if name in TEAM_WORLDS else _generated(name, episodes)
     made = []
     for number, world in enumerate(worlds):
         rng = np.random.default_rng((_STREAM, seed, number))
@@ -140,9 +139,9 @@ def _sample(world: World, team: int, radius: float, rng: np.random.Generator) ->
     found: list[Task] = []
     for _ in range(_ATTEMPTS):
         if grid is None:
-            here, there = _ENDS if len(found) % 2 == 0 else _ENDS[::-1]
+            side = len(found) % 2
             heading = float(rng.uniform(-math.pi, math.pi))
-            task = Task((*_within(here, rng), heading), _within(there, rng))
+            task = Task((*_within(_STARTS[side], rng), heading), _within(_GOALS[1 - side], rng))
         else:
             task, _field = sample_task_on_grid(grid, rng)
         if all(_apart(task, other, radius) for other in found):
@@ -181,6 +180,4 @@ def _apart(one: Task, other: Task, radius: float) -> bool:
 
 def _crowded(world: World, team: int) -> ValueError:
     """The error of a world that is too small."""
-    return ValueError(
-        f"team must have room in world {world.name!r}, got {team} robots: take fewer"
-    )
+    return ValueError(f"team must have room in world {world.name!r}, got {team} robots: take fewer")
