@@ -138,6 +138,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add_filter(parser)
     parser.add_argument(
+        "--approach",
+        type=float,
+        default=0.0,
+        metavar="SPEED",
+        help="the filter has the robot stand before what comes at this speed [m/s] (default: 0)",
+    )
+    parser.add_argument(
         "--plan",
         choices=["unknown", "known"],
         help="known: the robot's map begins with the world's walls (default: as in training)",
@@ -166,10 +173,14 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.names = team_worlds(options) if teams else parse_worlds(options.worlds)
         options.loaded = load_driver(options)
         if options.filter is None:
-            options.filter = needs_filter(options.loaded)
+            options.filter = bool(options.approach) or needs_filter(options.loaded)
+        if options.approach and not options.filter:
+            raise ValueError(f"--approach must be 0 with --no-filter, got {options.approach}")
         options.asked = conditions(options)
         check_physics(options.asked.physics)
-        TaskConfig(**options.loaded.env_arguments | options.asked.task)
+        task = TaskConfig(**options.loaded.env_arguments | options.asked.arguments)
+        if options.filter:
+            task.make_filter(approach=options.approach)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -187,6 +198,7 @@ def conditions(options: argparse.Namespace) -> Conditions:
         options.noise,
         options.latency,
         options.filter,
+        options.approach,
         options.robot,
         {name: value for name, value in task.items() if value is not None},
         options.team,
@@ -362,7 +374,9 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     if options.path is not None and options.path.is_dir():
         for sentence in warnings_of(options.path):
             print(f"warning: {sentence}")
-    driver: Drivable = filtered(policy, physics=asked.physics) if asked.filtered else policy
+    driver: Drivable = policy
+    if asked.filtered:
+        driver = filtered(policy, approach=asked.approach, **asked.arguments)
     folder = options.output or output_folder(options)
     if options.live:
         return show_live(driver, options)

@@ -2,9 +2,9 @@
 
 import math
 
-import ir_sim
 import pytest
 
+import ir_sim
 from mpfa_envs import Box, Cylinder, Polygon, Task, World, WorldTask
 from mpfa_envs.robots.resolve import resolve_robot
 

@@ -44,15 +44,15 @@ def _halls(name: str, *boxes: Box) -> World:
 TEAM_WORLDS: Final = {
     "crossing": World(name="crossing", size=(8.0, 8.0)),
     "door": _halls("door", Box(-0.1, 0.35, 0.1, 3.0), Box(-0.1, -3.0, 0.1, -0.35)),
-    "lane": _halls("lane", Box(-3.0, 0.3, 3.0, 3.0), Box(-3.0, -3.0, 3.0, -0.3)),
+    "lane": _halls("lane", Box(-3.0, 0.35, 3.0, 3.0), Box(-3.0, -3.0, 3.0, -0.35)),
     "bay": _halls(
         "bay",
-        *(Box(-3.0, 0.3, -0.8, 3.0), Box(0.8, 0.3, 3.0, 3.0), Box(-0.8, 1.5, 0.8, 3.0)),
-        Box(-3.0, -3.0, 3.0, -0.3),
+        *(Box(-3.0, 0.35, -0.8, 3.0), Box(0.8, 0.35, 3.0, 3.0), Box(-0.8, 1.5, 0.8, 3.0)),
+        Box(-3.0, -3.0, 3.0, -0.35),
     ),
 }
-"""Worlds for teams: a hall that all cross; two halls joined by a door of 0.7 m; by a lane, 6 m long
-and 0.6 m wide, in which robots cannot pass each other; by a lane with a bay in the middle."""
+"""Worlds for teams: a hall that all cross; two halls joined by a door, 0.7 m wide; by a lane of that
+width, 6 m long, in which a Kobuki cannot pass another; by such a lane with a bay in the middle."""
 
 
 class TeamTask(NamedTuple):
