@@ -119,10 +119,11 @@ ROOMS = (
     {"paths", "robots"},
     {"generators", "sensing"},
     {"safety"},
+    {"driver"},
     {"walkers", "tasks", "scene", "deploy"},
     {"env"},
-    {"policies", "planners", "ros"},
-    {"evaluation"},
+    {"policies", "planners"},
+    {"ros", "evaluation"},
     {"render"},
 )
 """The rooms of the navigation task, from the ground up."""
