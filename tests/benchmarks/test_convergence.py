@@ -58,5 +58,5 @@ def test_page_has_the_six_earlier_looks() -> None:
     rows = [("73.3 %", "89.7 %", "91.0 %"), ("94.8 %", "97.0 %", "93.8 %")]
     for row in [*rows, ("97.0 %", "97.8 %", "95.7 %")]:
         assert " | ".join(row) in table
-        changes = (ROOT / "docs/results/changes.md").read_text(encoding="utf-8")
+        changes = (ROOT / "docs/results/study.md").read_text(encoding="utf-8")
         assert " | ".join(row) in changes
