@@ -32,6 +32,8 @@ from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.priorities import action_gradient_priority
 
 METHODS_HERE = ("uniform", "per", "mpfa_per")
+LEARNING_STARTS = 100
+"""Actions at random before the first update."""
 
 
 class PriorityReplay(ReplayBuffer):
@@ -64,11 +66,13 @@ class PriorityReplay(ReplayBuffer):
     ) -> None:
         if method not in METHODS_HERE:
             raise ValueError(f"method must be one of {METHODS_HERE}, got {method!r}")
+        if buffer_size < n_envs:
+            raise ValueError(f"buffer_size must be at least n_envs = {n_envs}, got {buffer_size}")
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage must be False, got True")
         # Theirs holds one step, which nobody reads.
         super().__init__(n_envs, observation_space, action_space, device, n_envs)
-        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.buffer_size = buffer_size // n_envs
         slots = self.buffer_size * n_envs
         self.method = replace(METHODS["ddpg" if method == "uniform" else method], **settings)
         self.method.capacity = slots
@@ -97,8 +101,23 @@ class PriorityReplay(ReplayBuffer):
         rows = {"observation": now, "action": actions, "next": after}
         self.replay.extend(TensorDict(rows, [self.n_envs]))
 
+    def reset(self) -> None:
+        """Forget all transitions."""
+        self.replay.empty()
+        self.batch = None
+
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        """Sample a batch, and keep it for its priorities."""
+        """Sample a batch, and keep it for its priorities.
+
+        Raises:
+            RuntimeError: If the batch before got no priorities.
+        """
+        if self.signals and self.batch is not None:
+            raise RuntimeError(
+                f"replay_buffer_class must be ReplayBuffer for an algorithm that writes no "
+                f"priorities, got PriorityReplay with {self.method.name!r}: take PriorityTD3 or "
+                "PriorityDDPG"
+            )
         batch = self.batch = self.replay.sample(batch_size)
         after = batch["next"]
         arrays = (
@@ -172,6 +191,7 @@ def make_model(algorithm: str, task: Any, replay: str, **options: Any) -> Priori
         "buffer_size": 100_000,
         "policy_kwargs": {"net_arch": [64, 64]},
         "device": "cpu",
+        "learning_starts": LEARNING_STARTS,
         "replay_buffer_class": PriorityReplay,
         "replay_buffer_kwargs": {"method": replay, **settings},
         **options,
@@ -193,6 +213,8 @@ def main(arguments: Sequence[str] | None = None) -> float:
     parser.add_argument("--actions", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
+    if options.actions <= LEARNING_STARTS:
+        parser.error(f"--actions must be more than {LEARNING_STARTS}, got {options.actions}")
     model = make_model(options.algorithm, options.task, options.replay, seed=options.seed)
     model.learn(options.actions)
     env = model.get_env()

@@ -44,6 +44,9 @@ MEANT: Final[Mapping[str, tuple[float, float, str]]] = {
     "map_size": (1.0, 1000.0, "m"),
     **dict.fromkeys(("time_step", "check_period"), (1e-4, 10.0, "s")),
     "latency": (0.0, 5.0, "s"),
+    **dict.fromkeys(
+        ("goal_reward", "collision_reward", "progress_scale", "step_cost"), (0.0, 1e9, "")
+    ),
     **dict.fromkeys(("scan_timeout", "odometry_timeout", "command_timeout"), (1e-3, 60.0, "s")),
 }
 """Least and greatest size that a number can be meant to have, wherever it is given, and its unit;
@@ -62,7 +65,8 @@ def check_meant(name: str, value: float, quantity: str = "") -> None:
         meant, other = min(within, key=lambda each: abs(math.log(abs(each[0]) / middle)))
         hint = f"; did you mean {meant:.4g}, which is {value:g} {other}?"
     bound = f"at least {least:.4g}" if abs(value) < least else f"at most {most:.4g}"
-    raise ValueError(f"{name} must be {bound} {unit} in size, got {value:g}{hint}")
+    size = " ".join(filter(None, (bound, unit)))
+    raise ValueError(f"{name} must be {size} in size, got {value:g}{hint}")
 
 
 def check_number(name: str, value: Any) -> float:

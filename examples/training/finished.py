@@ -18,6 +18,29 @@ def is_finished(folder: Path) -> bool:
     return there and bool(read_json(folder / files.STATUS).get("finished"))
 
 
+def holds_result(folder: Path, result: str, settings: Mapping[str, Any]) -> bool:
+    """Return True if a folder has the result of a run with these settings, or else record them.
+
+    Args:
+        folder: Of the run.
+        result: Name of the file that is written at its end.
+        settings: Values that JSON has.
+
+    Raises:
+        ValueError: If there is a result of other settings, or a file that is damaged.
+    """
+    if not (folder / result).exists():
+        from torchrl_mpfa.saving import write_text_atomically
+
+        write_text_atomically(json.dumps(settings, indent=1) + "\n", folder / files.SETTINGS)
+        return False
+    before = read_json(folder / files.SETTINGS)
+    if before != settings:
+        names = [name for name in {**before, **settings} if before.get(name) != settings.get(name)]
+        raise ValueError(f"{folder} has a run with other {', '.join(names)}: name another folder")
+    return True
+
+
 def after_the_end(folder: Path) -> str:
     """Return one sentence on what can be done with a finished run."""
     status = read_json(folder / files.STATUS)

@@ -67,6 +67,7 @@ def controller(**arguments: Any) -> Controller:
 
 
 TASK: Rows = [
+    ({"progress_scale": 1e300}, r"progress_scale must be at most 1e\+09 in size, got 1e\+300"),
     ({"robot": "burgr"}, "robot must be .*got 'burgr' .did you mean 'burger'"),
     ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
     ({"progress": "path"}, "progress must be one of .*got 'path'"),

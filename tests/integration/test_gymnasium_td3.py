@@ -4,15 +4,61 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
 
 import gymnasium_td3
-from gymnasium_td3 import SCORES, Task, collect
+from gymnasium_td3 import SCORES, Scale, Task, collect
 from torchrl_mpfa.methods import METHODS
+from torchrl_mpfa.methods.her import GymnasiumGoals
+
+PENDULUM = "Pendulum-v1"
+POINT = "tests/Point-v0"
+
+
+class Point(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """A point in a square that is paid where it is near its goal, for ten steps."""
+
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (2,), np.float32)
+    observation_space = gymnasium.spaces.Dict(
+        {
+            "observation": gymnasium.spaces.Box(-9.0, 9.0, (3,)),
+            "achieved_goal": gymnasium.spaces.Box(-9.0, 9.0, (2,)),
+            "desired_goal": gymnasium.spaces.Box(-9.0, 9.0, (2,)),
+        }
+    )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place, self.steps = np.zeros(2, np.float32), 0
+        self.goal = self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32)
+        return self.seen(), {}
+
+    def seen(self) -> dict[str, np.ndarray]:
+        return {
+            "observation": np.array([*self.place, self.steps], np.float32),
+            "achieved_goal": self.place.copy(),
+            "desired_goal": self.goal.copy(),
+        }
+
+    def step(self, action: np.ndarray) -> Any:
+        self.place = np.clip(self.place + 0.1 * action, -1.0, 1.0).astype(np.float32)
+        self.steps += 1
+        reward = self.compute_reward(self.place, self.goal, {})
+        info = {"is_success": reward == 0.0}
+        return self.seen(), float(reward), False, self.steps == 10, info
+
+    def compute_reward(self, achieved: np.ndarray, wanted: np.ndarray, info: Any) -> np.ndarray:
+        return -(np.linalg.norm(achieved - wanted, axis=-1) > 0.3).astype(np.float64)
+
+
+if POINT not in gymnasium.registry:
+    gymnasium.register(POINT, Point)
 
 
 def rounds_of(number: int) -> tuple[Task, TensorDictBase]:
@@ -57,7 +103,13 @@ def test_action_reaches_the_whole_range_of_the_task() -> None:
     [
         (["--start", "99"], "--start must be at least one batch of 100, got 99"),
         (["--every", "300", "--steps", "200"], "--every must be in 10 to 200, got 300"),
-        (["--replay", "her"], "invalid choice: 'her'"),
+        (["--replay", "rud"], "invalid choice: 'rud'"),
+        (["--task", PENDULUM, "--replay", "her"], f"without hindsight, as {PENDULUM} has no goals"),
+        (["--task", PENDULUM, "--hindsight", "2"], f"without hindsight, as {PENDULUM} has no"),
+        (["--task", "CartPole-v1"], "must have vectors to see and to do, got CartPole-v1"),
+        (["--task", "Pendulums-v1"], "Environment `Pendulums` doesn't exist"),
+        (["--seed", "-1"], "--seed must be in 0 to 2**32 - 1, got -1"),
+        (["--steps", "300", "--start", "500", "--every", "200"], "--steps must be more than"),
         (["--replay", "per", "--positive-above", "1"], "--positive-above: "),
         (["--folder", "/dev/null"], "/dev/null"),
     ],
@@ -69,7 +121,7 @@ def test_what_the_page_cannot_do_is_rejected_before_it_trains(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(gymnasium_td3, "train", lambda options: pytest.fail("trained"))
+    monkeypatch.setattr(gymnasium_td3, "train", lambda *_: pytest.fail("trained"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
         gymnasium_td3.main(words)
@@ -100,10 +152,89 @@ def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
     rows = scores_in(folder)
     assert [row["steps"] for row in rows] == ["200"]
     assert {row["method"] for row in rows} == {"td3/mpfa_per"}
-    monkeypatch.setattr(gymnasium_td3, "train", lambda options: pytest.fail("made again"))
+    monkeypatch.setattr(gymnasium_td3, "train", lambda *_: pytest.fail("made again"))
     assert gymnasium_td3.main(command) == folder
     with pytest.raises(SystemExit):
         gymnasium_td3.main([*command, "--every", "100"])
+
+
+def test_rows_of_a_goal_task_end_with_the_goal_and_its_rewards_are_those_of_the_task() -> None:
+    task = Task(POINT, seed=0)
+    rows = torch.cat([collect(task, None, np.random.default_rng(0)) for _ in range(2)])
+    assert task.has_goal and (task.observations, task.actions) == (5, 2)
+    assert rows["observation"].shape == (20, 5)
+    assert rows["episode"].flatten().tolist() == [0] * 10 + [1] * 10
+    assert (rows["observation"][:10, 3:] == rows["observation"][0, 3:]).all()
+    assert not torch.equal(rows["observation"][10, 3:], rows["observation"][0, 3:])
+    # The last observation of an episode is its own, and not the first of the next.
+    assert rows["next", "observation"][9, 2] == 10 and rows["observation"][10, 2] == 0
+    relabel = GymnasiumGoals(task.compute_reward)
+    again = relabel(rows[:10], torch.tensor([4, 9]))
+    assert len(again) == 5 + 10 and "achieved_goal" not in again["next"]
+    achieved = rows["next", "achieved_goal"]
+    for number, (step, first) in enumerate([(4, 0), (9, 5)]):
+        part = again[first : first + step + 1]
+        assert (part["observation"][:, 3:] == achieved[step]).all(), number
+        assert (part["next", "observation"][:, 3:] == achieved[step]).all()
+        assert torch.equal(part["observation"][:, :3], rows["observation"][: step + 1, :3])
+        far = (achieved[: step + 1] - achieved[step]).norm(dim=-1) > 0.3
+        assert torch.equal(part["next", "reward"].flatten(), -far.float())
+        assert part["next", "reward"][-1] == 0.0
+    # What was stored is not changed.
+    assert (rows["observation"][:10, 3:] == rows["observation"][0, 3:]).all()
+
+
+def test_an_episode_that_was_terminated_gets_no_other_goal() -> None:
+    rows = collect(Task(POINT, seed=0), None, np.random.default_rng(0))
+    rows["next", "terminated"][-1] = True
+    with pytest.raises(ValueError, match="terminated of a goal task must be False at all steps"):
+        GymnasiumGoals(Point().compute_reward)(rows, torch.tensor([3]))
+
+
+def test_observations_of_goal_tasks_are_normalized_by_all_that_was_seen() -> None:
+    scale, seen = Scale(3, moves=True), torch.randn(40, 3) * torch.tensor([1.0, 20.0, 0.0]) + 7.0
+    for part in seen.split(8):
+        scale.see(part)
+    found = scale(seen)
+    assert found[:, :2].mean(0).abs().max() < 1e-5
+    assert (found[:, :2].std(0, correction=0) - 1.0).abs().max() < 1e-4
+    assert found[:, 2].abs().max() < 1e-3
+    assert scale(torch.full((3,), 1e6)).tolist() == [5.0, 5.0, 5.0]
+    assert torch.equal(Scale(3, moves=False)(seen), seen)
+
+
+def test_hindsight_adds_rows_and_another_method_takes_it_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+    kept = gymnasium_td3.make_replay
+    monkeypatch.setattr(
+        gymnasium_td3,
+        "make_replay",
+        lambda *words, **given: made.append(kept(*words, **given)) or made[-1],
+    )
+    monkeypatch.setattr(gymnasium_td3, "EPISODES", 2)
+    short = ["--task", POINT, "--steps", "60", "--start", "40", "--every", "60", "--eager"]
+    short += ["--batch-size", "16", "--width", "8", "--folder", str(tmp_path)]
+    for words in (["uniform"], ["her"], ["per", "--hindsight", "2"]):
+        gymnasium_td3.main([*short, "--replay", *words])
+    uniform, her, per = (len(replay.buffer) for replay in made)
+    assert uniform == 60 < per < her <= 60 * 5
+    for replay in made:
+        assert set(replay.buffer[:].keys()) >= {"observation", "action", "next"}
+        assert "achieved_goal" not in replay.buffer[:]["next"].keys()  # noqa: SIM118
+    names = {row["method"] for folder in tmp_path.iterdir() for row in scores_in(folder)}
+    assert names == {"td3/uniform", "td3/her", "td3/per-hindsight2"}
+
+
+@pytest.mark.slow
+def test_hindsight_learns_a_goal_task_that_uniform_replay_does_not(tmp_path: Path) -> None:
+    short = ["--task", POINT, "--steps", "3000", "--start", "500", "--every", "3000", "--eager"]
+    short += ["--gamma", "0.9", "--folder", str(tmp_path), "--width", "64"]
+    folder = gymnasium_td3.main([*short, "--replay", "her"])
+    [row] = scores_in(folder)
+    # At random a tenth of the episodes end near their goal.
+    assert float(row["score"]) >= 0.8
 
 
 @pytest.mark.slow

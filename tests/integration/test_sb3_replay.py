@@ -12,10 +12,11 @@ from torch import Tensor
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_replay import PriorityTD3, make_model
+from sb3_replay import PriorityReplay, PriorityTD3, main, make_model
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 ALGORITHMS = ["td3", "ddpg"]
@@ -140,3 +141,35 @@ def test_another_method_and_memory_of_one_array_are_rejected() -> None:
         make_model("td3", "Pendulum-v1", "lap")
     with pytest.raises(ValueError, match="optimize_memory_usage must be False, got True"):
         make_model("td3", "Pendulum-v1", "per", optimize_memory_usage=True)
+
+
+def test_an_algorithm_that_writes_no_priorities_is_an_error_at_its_second_update() -> None:
+    def model(replay: str) -> SAC:
+        given = {"replay_buffer_class": PriorityReplay, "replay_buffer_kwargs": {"method": replay}}
+        given |= {"learning_starts": 100, "policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
+        return SAC("MlpPolicy", "Pendulum-v1", **given)
+
+    with pytest.raises(RuntimeError, match="must be ReplayBuffer for"):
+        model("per").learn(110)
+    model("uniform").learn(110)
+
+
+def test_reset_forgets_all_transitions() -> None:
+    model = model_of("td3", "per")
+    model.replay_buffer.reset()
+    assert model.replay_buffer.size() == 0
+    model.learn(300)
+    assert model.replay_buffer.size() == 300
+
+
+def test_a_buffer_without_room_is_rejected() -> None:
+    with pytest.raises(ValueError, match="buffer_size must be at least n_envs = 1, got 0"):
+        make_model("td3", "Pendulum-v1", "per", buffer_size=0)
+
+
+def test_so_few_actions_that_nothing_is_learned_are_rejected(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["td3", "--actions", "100"])
+    assert "--actions must be more than 100, got 100" in capsys.readouterr().err

@@ -5,7 +5,8 @@ After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.o
 
 from __future__ import annotations
 
-from typing import Protocol, cast
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -37,6 +38,70 @@ class Relabel(Protocol):
             Transitions, batch size ``[R]``, with the entries that are stored.
         """
         ...
+
+
+class GymnasiumGoals:
+    """Gives an episode of a goal task of Gymnasium goals that it reached; the task itself pays.
+
+    Observations end with the goal, as ``CatTensors(["observation", "desired_goal"])`` of TorchRL
+    makes them. What the task calls ``achieved_goal`` after each step is read, and not stored.
+
+    Args:
+        compute_reward: That of the task: from goals that were achieved and wanted, ``[R, G]`` each,
+            and an empty mapping, to rewards, ``[R]``.
+
+    Examples:
+        >>> import numpy as np
+        >>> relabel = GymnasiumGoals(lambda achieved, wanted, info: -abs(achieved - wanted)[:, 0])
+        >>> place = torch.tensor([[1.0], [2.0]])
+        >>> seen = torch.cat((place - 1.0, torch.full((2, 1), 9.0)), -1)
+        >>> after = {
+        ...     "observation": torch.cat((place, torch.full((2, 1), 9.0)), -1),
+        ...     "achieved_goal": place,
+        ...     "reward": torch.zeros(2, 1),
+        ...     "terminated": torch.zeros(2, 1, dtype=torch.bool),
+        ... }
+        >>> rows = relabel(TensorDict({"observation": seen, "next": after}, [2]), torch.tensor([1]))
+        >>> rows["observation"].tolist(), rows["next", "reward"].flatten().tolist()
+        ([[0.0, 2.0], [1.0, 2.0]], [-1.0, 0.0])
+    """
+
+    entries: ClassVar[tuple[NestedKey, ...]] = (("next", "achieved_goal"),)
+    """Entries that it reads, other than observation, reward and ends; its rows lack them."""
+
+    def __init__(self, compute_reward: Callable[[Any, Any, dict[str, Any]], Any]) -> None:
+        self._compute_reward = compute_reward
+
+    def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:
+        """Relabel an episode.
+
+        Args:
+            episode: Its transitions in their order, batch size ``[T]``.
+            steps: Numbers of the steps after which the goals were reached, ``[K]``.
+
+        Returns:
+            The transitions before each of these steps and that of the step itself, ``[R]``.
+
+        Raises:
+            ValueError: If the episode was terminated: whether another goal would have ended it is
+                not known.
+        """
+        if episode["next", "terminated"].any():
+            raise ValueError(
+                "terminated of a goal task must be False at all steps, got True: let the task go "
+                "on at its goal (continuing_task=True in gymnasium-robotics' mazes)"
+            )
+        achieved = episode["next", "achieved_goal"]
+        chosen = torch.cat([torch.arange(step + 1) for step in steps.tolist()])
+        goals = achieved[steps].repeat_interleave(steps.to(achieved.device) + 1, dim=0)
+        rows = episode.exclude(*self.entries)[chosen]
+        for key in ("observation", ("next", "observation")):
+            rows[key][..., -goals.shape[-1] :] = goals
+        here, there = achieved[chosen].cpu().numpy(), goals.cpu().numpy()
+        paid = torch.as_tensor(self._compute_reward(here, there, {}))
+        reward = rows["next", "reward"]
+        rows["next", "reward"] = paid.to(reward).reshape(reward.shape)
+        return rows
 
 
 def future_goals(length: int, goals: int, generator: torch.Generator | None = None) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
-from training.settings.rules import NAME, at_least, choice, setting, up_to
+from training.settings.rules import NAME, at_least, between, choice, setting, up_to
 
 _COMPILE: Rule = (lambda value: value in ("auto", True, False), "auto, true or false")
 
@@ -45,7 +45,7 @@ class LearnerSettings:
     """Last layers start within this, near the middle of the tanh; null: PyTorch's start."""
     critic_weight_decay: float = setting(1e-4, NOT_NEGATIVE)
     """L2 decay of the critic."""
-    reward_scale: float = setting(0.1, POSITIVE)
+    reward_scale: float = setting(0.1, between(1e-9, 1e9, "from 1e-9 to 1e9"))
     """Factor of rewards in the loss, so that Q is of order one."""
     saturation_penalty: float = setting(1.0, NOT_NEGATIVE)
     """Factor of the penalty on actions in the tanh's flat ends."""
