@@ -318,8 +318,8 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
     try:
         # An episode adds as many rows at most for each of its goals.
         options.method = given | {"capacity": options.steps * (1 + method.hindsight)}
-        task = Task(options.task, seed=options.seed)
         files.check_folder(options.folder)
+        task = Task(options.task, seed=options.seed)
     except (ValueError, OSError, ImportError, gymnasium.error.Error) as error:
         parser.error(" ".join(str(error).split()))
     if method.hindsight and not task.has_goal:

@@ -49,7 +49,7 @@ POCKET = World(
 def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> PlanningState:
     """A robot that drives east with its goal ahead [m], and a wall before it at a distance [m]."""
     rooms = np.full((121, 121), ROOMY)
-    kept, points = BODY.radius + BODY.clearance, np.empty((1, 0, 3))
+    kept, points = BODY.radius + BODY.clearance, np.empty((1, 0, 4))
     if wall < math.inf:
         beside = wall * np.tan(np.linspace(-0.9, 0.9, 61))
         points = np.stack((np.full(61, wall), beside, np.full(61, kept**2)), axis=1)[None]

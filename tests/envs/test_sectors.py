@@ -342,3 +342,27 @@ def test_what_lies_beyond_the_last_ray_is_not_seen(x: float, view: int, silent: 
     assert ranges.max() < 6.0
     with pytest.raises(ScanError, match="does not reach the sector at 175 degrees"):
         Sectors(facts, mount=robot.lidar_mount, silent=silent).read(scan)
+
+
+@pytest.mark.parametrize("x", [0.1, -0.1])
+def test_what_a_lidar_that_turns_right_does_not_see_is_what_one_that_turns_left_does_not(
+    x: float,
+) -> None:
+    robot = replace(ROBOTS["kobuki"], field_of_view=230.0, lidar_mount=(x, 0.0, 0.0))
+    facts = card(robot=ROBOTS["kobuki"], sectors=36, field_of_view=360.0)
+    leftward = seen_by(robot, (0.6, -1.4, 0.4))
+    last = leftward.angle_min + leftward.angle_increment * (len(leftward.ranges) - 1)
+    rightward = leftward._replace(
+        angle_min=last, angle_increment=-leftward.angle_increment, ranges=leftward.ranges[::-1]
+    )
+    found = []
+    for scan in (leftward, rightward):
+        sectors = Sectors(facts, mount=robot.lidar_mount, unseen=0.3)
+        ranges, _ = sectors.read(scan)
+        blind, hidden = sectors.blind(scan)
+        found.append((ranges, np.sort(blind), hidden))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    ends = [sectors._measured(scan)[0].ends for scan in (leftward, rightward)]
+    # The walls beside it are at different distances, and so the two ends move by different angles.
+    assert ends[0] == pytest.approx(ends[1]) and abs(sum(ends[0])) > 0.05

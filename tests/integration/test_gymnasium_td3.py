@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 import gymnasium_td3
-from gymnasium_td3 import SCORES, Scale, Task, collect
+import torchrl_mpfa as mpfa
+from gymnasium_td3 import SCORES, Scale, Task, collect, score
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.her import GymnasiumGoals
+from torchrl_mpfa.selection import SampledBatch
 
 PENDULUM = "Pendulum-v1"
 POINT = "tests/Point-v0"
@@ -184,6 +187,43 @@ def test_rows_of_a_goal_task_end_with_the_goal_and_its_rewards_are_those_of_the_
     assert (rows["observation"][:10, 3:] == rows["observation"][0, 3:]).all()
 
 
+class Towards:
+    """Drives to the goal, and away from it in the last steps if it is to leave."""
+
+    def __init__(self, leaves: bool) -> None:
+        self.leaves = leaves
+
+    def __call__(self, seen: Tensor) -> np.ndarray:
+        if self.leaves and seen[2] >= 5:
+            return -np.sign(seen[3:].numpy())
+        return np.clip(5.0 * (seen[3:] - seen[:2]).numpy(), -1.0, 1.0)
+
+
+def test_the_score_of_a_goal_task_is_the_share_of_episodes_that_end_at_the_goal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gymnasium_td3, "EPISODES", 4)
+    assert score(POINT, Towards(leaves=False), seed=0) == 1.0
+    assert score(POINT, Towards(leaves=True), seed=0) == 0.0
+
+
+def test_the_score_of_another_task_is_the_mean_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gymnasium_td3, "EPISODES", 2)
+    still = lambda seen: np.zeros(1, np.float32)  # noqa: E731
+    task, returns = Task(PENDULUM, seed=5), []
+    for _ in range(2):
+        steps = [task.step(torch.from_numpy(task.state), still(None)) for _ in range(200)]
+        returns.append(sum(step["next", "reward"].item() for step in steps))
+    assert score(PENDULUM, still, seed=5) == pytest.approx(sum(returns) / 2)
+
+
+def test_actions_have_noise_of_the_spread_that_was_asked_for() -> None:
+    task, still = Task(POINT, seed=0), lambda seen: np.zeros(2, np.float32)
+    source = np.random.default_rng(0)
+    rows = [collect(task, still, source, noise=0.3)["action"] for _ in range(40)]
+    assert torch.cat(rows).std() == pytest.approx(0.3, rel=0.1)
+
+
 def test_an_episode_that_was_terminated_gets_no_other_goal() -> None:
     rows = collect(Task(POINT, seed=0), None, np.random.default_rng(0))
     rows["next", "terminated"][-1] = True
@@ -213,6 +253,17 @@ def test_hindsight_adds_rows_and_another_method_takes_it_too(
         "make_replay",
         lambda *words, **given: made.append(kept(*words, **given)) or made[-1],
     )
+    prepared: set[Any] = set()
+    run = mpfa.run_updates
+    monkeypatch.setattr(
+        mpfa,
+        "run_updates",
+        lambda *words, prepare, **given: (
+            prepared.clear(),
+            prepared.add(prepare),
+            run(*words, prepare=prepare, **given),
+        )[2],
+    )
     monkeypatch.setattr(gymnasium_td3, "EPISODES", 2)
     short = ["--task", POINT, "--steps", "60", "--start", "40", "--every", "60", "--eager"]
     short += ["--batch-size", "16", "--width", "8", "--folder", str(tmp_path)]
@@ -220,6 +271,17 @@ def test_hindsight_adds_rows_and_another_method_takes_it_too(
         gymnasium_td3.main([*short, "--replay", *words])
     uniform, her, per = (len(replay.buffer) for replay in made)
     assert uniform == 60 < per < her <= 60 * 5
+    goals = [replay.buffer[:]["observation"][:, 3:].unique(dim=0) for replay in made]
+    # Six episodes have a goal each, and as many more as were asked for.
+    assert [len(of_run) for of_run in goals] == [6, 6 * 5, 6 * 3]
+    assert made[2].buffer.sampler.beta == 1.0
+    [prepare] = prepared
+    sampled = prepare(SampledBatch(made[2].buffer.sample()))
+    assert prepare.__self__.count == 60
+    for rows in (sampled.batch, sampled.batch["next"]):
+        assert rows["observation"].abs().max() <= 5.0
+    raw = made[2].buffer[:]["next", "observation"]
+    assert raw[:, 2].max() == 10.0
     for replay in made:
         assert set(replay.buffer[:].keys()) >= {"observation", "action", "next"}
         assert "achieved_goal" not in replay.buffer[:]["next"].keys()  # noqa: SIM118

@@ -136,6 +136,12 @@ def test_saved_model_learns_on_with_priorities(tmp_path: Path) -> None:
     assert len(after) == 220 and (after[:200] != before).sum() > 20
 
 
+def test_a_reward_counts_as_positive_above_the_mean_where_all_have_one_sign() -> None:
+    assert (
+        make_model("td3", "Pendulum-v1", "mpfa_per").replay_buffer.method.positive_above == "mean"
+    )
+
+
 def test_another_method_and_memory_of_one_array_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"method must be one of .*, got 'lap'"):
         make_model("td3", "Pendulum-v1", "lap")

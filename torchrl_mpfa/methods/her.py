@@ -52,7 +52,7 @@ class GymnasiumGoals:
 
     Examples:
         >>> import numpy as np
-        >>> relabel = GymnasiumGoals(lambda achieved, wanted, info: -abs(achieved - wanted)[:, 0])
+        >>> relabel = GymnasiumGoals(lambda achieved, wanted, info: (achieved == wanted)[:, 0])
         >>> place = torch.tensor([[1.0], [2.0]])
         >>> seen = torch.cat((place - 1.0, torch.full((2, 1), 9.0)), -1)
         >>> after = {
@@ -63,7 +63,7 @@ class GymnasiumGoals:
         ... }
         >>> rows = relabel(TensorDict({"observation": seen, "next": after}, [2]), torch.tensor([1]))
         >>> rows["observation"].tolist(), rows["next", "reward"].flatten().tolist()
-        ([[0.0, 2.0], [1.0, 2.0]], [-1.0, 0.0])
+        ([[0.0, 2.0], [1.0, 2.0]], [0.0, 1.0])
     """
 
     entries: ClassVar[tuple[NestedKey, ...]] = (("next", "achieved_goal"),)

@@ -12,7 +12,8 @@ import numpy as np
 
 from mpfa_envs.checks import MEANT, check_meant
 from mpfa_envs.deploy.card import check_finite
-from mpfa_envs.deploy.reach import Reach
+from mpfa_envs.deploy.reach import closes_in
+from mpfa_envs.sensing.hits import Hits
 from mpfa_envs.sensing.map_loops import UNKNOWN
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.sectors import Points
@@ -118,7 +119,7 @@ class Plan(NamedTuple):
 
 
 class MapPath:
-    """A map around a place, the path over it to the goal, and whether there is one."""
+    """A map around a place, which forgets what has left, and the path over it to the goal."""
 
     def __init__(self, card: Card) -> None:
         # Without Numba the loops would run, but a thousand times more slowly.
@@ -128,7 +129,8 @@ class MapPath:
         lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
         self._center = np.zeros(2)
-        self._reach, self._far = Reach(card.robot.radius), card.max_range
+        self._hits, self._far = Hits(), card.max_range
+        self._radius = card.robot.radius
         # The loops are compiled by their first call, which takes seconds.
         self.begin((0.0, 0.0), (10.0, 10.0))
         here = np.zeros(3)
@@ -142,10 +144,10 @@ class MapPath:
         self._center[:] = center
         extent: Any = SimpleNamespace(size=size)
         if plan is None:
-            self._reach.begin(center, size)
+            self._hits.begin(center, size)
             self._memory.begin(0, extent)
         else:
-            self._reach.begin(center, size, plan.world, (*plan.middle, plan.pose[2]))
+            self._hits.begin(center, size, plan.world, (*plan.middle, plan.pose[2]))
             x, y = np.subtract(plan.middle, center).tolist()
             self._memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
 
@@ -157,7 +159,7 @@ class MapPath:
         self, goal: tuple[float, float], radius: float, place: tuple[float, float]
     ) -> bool:
         """Return True if what is known keeps a place from within a radius of a goal [m]."""
-        return self._reach.closes_in(goal, radius, place)
+        return closes_in(self._hits, self._radius, goal, radius, place)
 
     def reject_closed(
         self, goal: tuple[float, float], radius: float, place: tuple[float, float]
@@ -178,7 +180,9 @@ class MapPath:
     ) -> NDArray[np.float64]:
         """Enter points taken at a pose; direction (x, y) and length of the path, ``[1, 3]``."""
         x, y, heading = taken[:3].tolist()
-        self._reach.see(x, y, points.angles + heading, points.ranges, self._far)
+        left = self._hits.see(x, y, points.angles + heading, points.ranges, self._far)
+        if len(left):
+            self._memory.forget(0, left, self._hits.places - self._center)
         poses = np.zeros((2, 1, 5))
         poses[:, 0, :3] = pose[:3], taken[:3]
         poses[:, 0, :2] -= self._center

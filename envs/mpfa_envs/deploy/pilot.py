@@ -22,7 +22,7 @@ from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import pair_of
-from mpfa_envs.robots.drives import Orders
+from mpfa_envs.robots.drives import OFF, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from mpfa_envs.safety.filter import SafetyFilter
     from mpfa_envs.worlds.world import World
 
 _TOWARDS: Final = math.radians(45.0)
@@ -77,6 +78,8 @@ class Pilot:
             position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
+        approach: Speed of what may come [m/s]: the filter has the robot stand before such a thing,
+            seen or hidden by what is seen, could touch it. Walls are such things, too.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot drives the orders under way first, and
             decides for the state that it comes to; its filter allows for an error of 0.05 s, and
@@ -103,6 +106,7 @@ class Pilot:
         silent: Silent = "reject",
         map_size: float = 40.0,
         clearance: float | None = None,
+        approach: float = 0.0,
         latency: float | None = None,
         goal_radius: float | None = None,
     ) -> None:
@@ -121,7 +125,8 @@ class Pilot:
         )
         self._ground = Ground(card, map_size)
         self._body = body_of(card.robot, self.robot, self.pace)
-        self._keep = filter_of(card, self.robot, self._body, clearance)
+        self._approach = check_not_negative("approach", approach)
+        self._keep = self._filter(clearance)
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -158,9 +163,15 @@ class Pilot:
     def adjust(self, *, clearance: float | None = None, goal_radius: float | None = None) -> None:
         """Change clearance or goal radius, also while driving; None leaves it as it is [m]."""
         if clearance is not None:
-            self._keep = filter_of(self.card, self.robot, self._body, clearance)
+            self._keep = self._filter(clearance)
         if goal_radius is not None:
             self._arrival.set_radius(goal_radius)
+
+    def _filter(self, clearance: float | None) -> SafetyFilter | None:
+        """Make the filter that keeps a clearance [m]; None: no filter."""
+        # At a slower pace things come faster, in the policy's time.
+        approach = self._approach / self.pace
+        return filter_of(self.card, self.robot, self._body, clearance, approach)
 
     @property
     def recoveries(self) -> int:
@@ -347,8 +358,18 @@ class Pilot:
         scan_pose: tuple[float, float, float] | None = None,
         time: float | None = None,
         age: float = 0.0,
+        scan_age: float = 0.0,
     ) -> Command:
         """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
+
+        Args:
+            scan: What the lidar has measured.
+            pose: As there.
+            speeds: As there.
+            scan_pose: As there.
+            time: As there.
+            age: As there.
+            scan_age: Age of the scan then [s], in which things may have come nearer.
 
         Returns:
             The speeds.
@@ -383,7 +404,9 @@ class Pilot:
             reject_blind_front(blind)
             # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             states[:, : self.card.sectors][:, hidden] = 1.0
-            left, right = nearest_admissible(self._keep, learned, states, (left, right))
+            # Wheels that brake all the time stand a time step later than those that do so in steps.
+            old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
+            left, right = nearest_admissible(self._keep, learned, states, (left, right), old)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
 

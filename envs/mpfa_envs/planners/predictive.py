@@ -13,7 +13,7 @@ from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
 from mpfa_envs.planners.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
 from mpfa_envs.robots.motion_loops import pairs_within
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.safety.loops import least_room, see
+from mpfa_envs.safety.loops import least_room, room_for_points, see
 from mpfa_envs.sensing.map_loops import BLOCKED, cell_of
 from mpfa_envs.sensing.map_memory import RESOLUTION
 
@@ -191,7 +191,8 @@ class PredictiveControl:
         pose = x - left, y - low, heading
         goal = episode.goal[0] - left, episode.goal[1] - low, self._radius
         seen = self._keep.seen(observation[None])
-        points, counts = np.empty((1, seen[0].shape[1], 3)), np.empty(1, np.int64)
+        rays = room_for_points(seen[0].shape[1], self._body.approach)
+        points, counts = np.empty((1, rays, 4)), np.empty(1, np.int64)
         see(seen, self._ahead, 0.0, points, counts)
         near = points[0, : counts[0]]
         room_around(near, heading, self._rooms)

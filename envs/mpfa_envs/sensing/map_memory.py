@@ -14,6 +14,7 @@ from mpfa_envs.sensing.map_loops import (
     cell_of,
     enter_scans,
     follow_path,
+    forget_cells,
 )
 from mpfa_envs.worlds.arrays import grown
 
@@ -91,6 +92,7 @@ class MapMemory:
         )
         """The maps, as compiled loops read them."""
         self._paths = np.zeros((count, 3))
+        self._plans = [np.zeros((0, 0), dtype=np.uint8)] * count
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         radius = robot.radius
         bounds = radius + _BLOCKED, radius + _TIGHT, radius + _NEAR
@@ -131,6 +133,7 @@ class MapMemory:
             levels[index, : sides[0], : sides[1]] = sum(
                 (clearance <= bound).astype(np.uint8) for bound in self._lengths[1:4]
             )
+        self._plans[index] = levels[index, : sides[0], : sides[1]].copy()
         self._paths[index] = 0.0
 
     def remember(
@@ -165,6 +168,22 @@ class MapMemory:
         how = self.arrays, self._lengths, self._mount
         enter_scans(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
+
+    def forget(self, index: int, cells: NDArray[np.int64], places: NDArray[np.float64]) -> None:
+        """Forget hits in some cells of a robot's map, and find its path again.
+
+        Args:
+            index: Number of the robot.
+            cells: Columns and rows of the cells, ``[C, 2]``.
+            places: Hits that are still there (x, y) [m], ``[P, 2]``.
+        """
+        columns, rows = self.arrays.shapes[index]
+        resolution, blocked, tight, near = self._lengths[:4]
+        bounds = blocked / resolution, tight / resolution, near / resolution
+        levels, plan = self.arrays.levels[index, :columns, :rows], self._plans[index]
+        points = (places - self.arrays.origins[index]) / resolution
+        forget_cells(levels, plan, cells, points, bounds)
+        self.arrays.costs[index] = UNKNOWN
 
     def known_map(self, index: int, x: float, y: float) -> KnownMap:
         """Give a robot's map and its path from a position, for a picture.

@@ -7,11 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
 
 import report
+from training.comparison.scores import height
 
 Row = tuple[str, str, int, float, float]
 HEAD = ["task", "method", "seed", "steps", "score"]
@@ -72,6 +74,13 @@ def test_runs_are_compared_up_to_the_steps_that_all_have(tmp_path: Path) -> None
     text = reported(tmp_path, rows_of("sac", [1, 2, 3]), short)
     assert "score at 10 steps" in text
     assert "| mine | 2.500 |" in text
+
+
+def test_the_height_of_a_curve_counts_what_is_between_its_ends() -> None:
+    curve = np.array([0.0, 10.0, 20.0, 40.0]), np.array([0.0, 1.0, 0.0, 4.0])
+    assert height(curve, 0.0, 20.0) == pytest.approx(0.5)
+    assert height(curve, 5.0, 30.0) == pytest.approx((3.75 + 5.0 + 10.0) / 25.0)
+    assert height(curve, 10.0, 10.0) == 1.0
 
 
 def test_each_task_has_tables_of_its_own(tmp_path: Path) -> None:

@@ -204,6 +204,17 @@ def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: K
     assert run.tracker.upload is not None and run.tracker.upload.endswith(run.tracker.run_id)
 
 
+def test_pictures_of_an_action_that_was_logged_are_logged_all_the_same(
+    tmp_path: Path, kept: Kept
+) -> None:
+    WandbLog(tiny(), tmp_path, run_id="abc").log({"train/reward": 1.0}, 32)
+    log, before = WandbLog(tiny(), tmp_path, run_id="abc"), len(kept.rows)
+    for name in ("train/reward", "policy/success", "evaluate/D/success"):
+        log.log({name: 1.0}, 32)
+    added = [name for row in list(kept.rows.values())[before:] for name in row]
+    assert [name for name in added if name != "actions"] == ["policy/success", "evaluate/D/success"]
+
+
 def test_a_run_that_is_begun_anew_begins_new_logs(tmp_path: Path) -> None:
     for log in (files.CSV, files.TENSORBOARD):
         (tmp_path / log).mkdir()
