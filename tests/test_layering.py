@@ -169,10 +169,7 @@ MESSAGES = {
             {"benchmarks/speed/bullet_world.py", "envs/mpfa_envs/robots/simulation.py"},
         ),
         ({"wandb"}, {"examples/training/run/loggers.py"}),
-        (
-            {"optuna"},
-            {"examples/training/comparison/ranges.py", "examples/training/comparison/search.py"},
-        ),
+        ({"optuna"}, {"examples/tune.py"}),
         (
             {"rclpy", *MESSAGES},
             {
