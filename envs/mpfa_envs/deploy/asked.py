@@ -36,6 +36,12 @@ class Asked:
         """The drive, or its map, has begun."""
         self._told = False
 
+    @property
+    def is_led(self) -> bool:
+        """True if a planner drives where a policy stood still."""
+        leads = getattr(self._driver, "leads", None)
+        return leads is not None and bool(leads(0))
+
     def act(
         self,
         rows: NDArray[np.float32],  # observations in the states that it may be in, [S, O]

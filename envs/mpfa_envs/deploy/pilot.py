@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_not_negative, check_number
+from mpfa_envs.checks import check_bool, check_not_negative, check_number
 from mpfa_envs.deploy.adaptation import (
     body_of,
     cannot_turn,
@@ -88,6 +88,8 @@ class Pilot:
         goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
             Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
             where it arrives.
+        rescue: If True, and there are a map and a filter, predictive control leads the robot away
+            where it stands still again (:class:`~mpfa_envs.control.rescue.Rescued`).
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -109,6 +111,7 @@ class Pilot:
         clearance: float | None = None,
         latency: float | None = None,
         goal_radius: float | None = None,
+        rescue: bool = True,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -125,6 +128,14 @@ class Pilot:
         self._ground = Ground(card, map_size)
         self._body = body_of(card.robot, self.robot, self.pace)
         self._keep = filter_of(card, self.robot, self._body, clearance)
+        check_bool("rescue", rescue)
+        if rescue and card.memory == "map" and self._keep is not None:
+            # It needs Numba, as a map does.
+            from mpfa_envs.control.predictive import PredictiveControl
+            from mpfa_envs.control.rescue import Rescued
+
+            if not isinstance(driver, PredictiveControl):
+                driver = Rescued(driver)
         self._asked = Asked(driver, card, self._ground, self._make_filter)
         self._planned: SafetyFilter | None = None
         self._way_back = WayBack(card.robot, self.period)
@@ -171,6 +182,11 @@ class Pilot:
     def recoveries(self) -> int:
         """How often the robot has driven back since it set out."""
         return self._way_back.count
+
+    @property
+    def is_led(self) -> bool:
+        """True while predictive control leads a robot away that stood still again."""
+        return self._asked.is_led
 
     @property
     def has_filter(self) -> bool:
@@ -376,7 +392,7 @@ class Pilot:
         action = self._asked.act(rows, states, ahead, goal, self.goal_radius)
         learned = self.card.robot
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
-        back = self._way_back.speeds(pose, self._time, reverses=reverses)
+        back = self._way_back.speeds(pose, self._time, reverses=reverses, led=self._asked.is_led)
         left, right = back or learned.wheel_speeds(action)
         share = min(1.0, slower / max(abs(left + right) / 2.0, 1e-9))
         left, right = share * left, share * right
