@@ -120,6 +120,7 @@ ROOMS = (
     {"generators", "sensing"},
     {"safety"},
     {"driver"},
+    {"control"},
     {"walkers", "tasks", "scene", "deploy"},
     {"env"},
     {"policies", "planners"},

@@ -19,10 +19,7 @@ from mpfa_envs import (
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.driver import Driver
-from mpfa_envs.paths.grid_loops import MOVES, path_lengths
-from mpfa_envs.planners import PredictiveControl
-from mpfa_envs.planners.predictive_loops import (
+from mpfa_envs.control.predictive_loops import (
     CELL,
     ROOMY,
     Effort,
@@ -31,6 +28,9 @@ from mpfa_envs.planners.predictive_loops import (
     rollout,
     room_around,
 )
+from mpfa_envs.driver import Driver
+from mpfa_envs.paths.grid_loops import MOVES, path_lengths
+from mpfa_envs.planners import PredictiveControl
 from mpfa_envs.robots.model import ROBOTS, RobotModel
 from mpfa_envs.tasks.sampling import WorldTask
 

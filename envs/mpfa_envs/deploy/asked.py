@@ -36,6 +36,12 @@ class Asked:
         """The drive, or its map, has begun."""
         self._told = False
 
+    @property
+    def is_led(self) -> bool:
+        """True if a planner drives where a policy stood still."""
+        leads = getattr(self._driver, "leads", None)
+        return leads is not None and bool(leads(0))
+
     def act(
         self,
         rows: NDArray[np.float32],  # observations in the states that it may be in, [S, O]
@@ -75,3 +81,12 @@ class Asked:
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         return action
+
+
+def rescued(driver: Action | Driver) -> Action | Driver:
+    """Return a driver that predictive control leads away where the robot stands still again."""
+    # It needs Numba, as a map does.
+    from mpfa_envs.control.predictive import PredictiveControl
+    from mpfa_envs.control.rescue import Rescued
+
+    return driver if isinstance(driver, PredictiveControl) else Rescued(driver)

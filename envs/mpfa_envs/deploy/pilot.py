@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_not_negative, check_number
+from mpfa_envs.checks import check_bool, check_not_negative, check_number
 from mpfa_envs.deploy.adaptation import (
     body_of,
     cannot_turn,
@@ -18,7 +18,7 @@ from mpfa_envs.deploy.adaptation import (
     reject_blind_front,
     tolerance,
 )
-from mpfa_envs.deploy.asked import Asked
+from mpfa_envs.deploy.asked import Asked, rescued
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
@@ -89,6 +89,8 @@ class Pilot:
         goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
             Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
             where it arrives.
+        rescue: If True, and there are a map and a filter, predictive control leads the robot away
+            where it stands still again (:class:`~mpfa_envs.control.rescue.Rescued`).
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -111,6 +113,7 @@ class Pilot:
         approach: float = 0.0,
         latency: float | None = None,
         goal_radius: float | None = None,
+        rescue: bool = True,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -128,6 +131,8 @@ class Pilot:
         self._body = body_of(card.robot, self.robot, self.pace)
         self._approach = check_not_negative("approach", approach)
         self._keep = self._filter(clearance)
+        if check_bool("rescue", rescue) and card.memory == "map" and self._keep is not None:
+            driver = rescued(driver)
         self._asked = Asked(driver, card, self._ground, self._make_filter)
         self._planned: SafetyFilter | None = None
         self._way_back = WayBack(card.robot, self.period)
@@ -173,13 +178,18 @@ class Pilot:
     def _filter(self, clearance: float | None) -> SafetyFilter | None:
         """Make the filter that keeps a clearance [m]; None: no filter."""
         # At a slower pace things come faster, in the policy's time.
-        approach = self._approach / self.pace
-        return filter_of(self.card, self.robot, self._body, clearance, approach)
+        facts = self.card, self.robot, self._body
+        return filter_of(*facts, clearance, self._approach / self.pace)
 
     @property
     def recoveries(self) -> int:
         """How often the robot has driven back since it set out."""
         return self._way_back.count
+
+    @property
+    def is_led(self) -> bool:
+        """True while predictive control leads a robot away that stood still again."""
+        return self._asked.is_led
 
     @property
     def has_filter(self) -> bool:
@@ -395,7 +405,7 @@ class Pilot:
         action = self._asked.act(rows, states, ahead, goal, self.goal_radius)
         learned = self.card.robot
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
-        back = self._way_back.speeds(pose, self._time, reverses=reverses)
+        back = self._way_back.speeds(pose, self._time, reverses=reverses, led=self._asked.is_led)
         left, right = back or learned.wheel_speeds(action)
         share = min(1.0, slower / max(abs(left + right) / 2.0, 1e-9))
         left, right = share * left, share * right

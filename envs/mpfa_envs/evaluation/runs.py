@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.deploy.maneuvers import stands_still
+from mpfa_envs.control.standing import stands_still
 from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, sct, spl

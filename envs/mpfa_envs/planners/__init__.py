@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from mpfa_envs.checks import check_choice, got
+from mpfa_envs.control.predictive import PredictiveControl
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import (
@@ -17,7 +18,6 @@ from mpfa_envs.planners.map_planner import (
     shortest_path,
 )
 from mpfa_envs.planners.piloted import pilot_of
-from mpfa_envs.planners.predictive import PredictiveControl
 from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.sensing.observation import Memory
 

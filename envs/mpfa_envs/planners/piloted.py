@@ -10,9 +10,9 @@ from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.safety.filter import CLEARANCE
 
 if TYPE_CHECKING:
+    from mpfa_envs.control.predictive import PredictiveControl
     from mpfa_envs.planners.dynamic_window import DynamicWindow
     from mpfa_envs.planners.map_planner import MapPlanner
-    from mpfa_envs.planners.predictive import PredictiveControl
 
 
 def pilot_of(planner: MapPlanner | DynamicWindow | PredictiveControl, **options: Any) -> Pilot:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.checks import check_seed
-from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE, path_lengths
-from mpfa_envs.planners.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
+from mpfa_envs.control.cost_to_go import cost_to_go
+from mpfa_envs.control.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
 from mpfa_envs.robots.motion_loops import pairs_within
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.loops import least_room, room_for_points, see
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
     from mpfa_envs.sensing.map_loops import MapArrays
     from mpfa_envs.worlds.shapes import Point
 
-_FACTORS: Final = np.array((5, 8, 150, 1000))
-"""Cost of a step in a free cell, one near an obstacle, a tight and a blocked one."""
-_STEP: Final = RESOLUTION * STEP_SCALE / 5
-"""Length of a straight step over its cost [m]."""
-_BUCKETS: Final = 2500
-"""More than the costliest step costs."""
 _LENGTH: Final = 1.12
 """Length of a plan at full speed [m]."""
 _HELD: Final = 0.14
@@ -52,6 +46,8 @@ _PLACE: Final = 0.1
 """Radius of such a place [m]."""
 _RAISED: Final = 25
 """By how much cells cost more before which a robot was stuck: half a meter each."""
+_MOVED: Final = 0.5
+"""Distance after which lengths are found again, as those around the robot count [m]."""
 _AHEAD: Final = 12
 """Cells of the path ahead of a stuck robot among which the sectors show what closes it."""
 
@@ -65,6 +61,7 @@ class _Episode:
     levels: NDArray[np.uint8]  # its map when the lengths were found, [columns, rows]
     raised: NDArray[np.int64]  # by how much cells cost more since it was stuck before them
     lengths: NDArray[np.float64]  # of the cheapest paths from each cell to the goal [m]
+    found_at: Point = (math.inf, math.inf)  # where the robot was then, from the first cell [m]
     place: Point = (math.inf, math.inf)  # the last one that it left [m]
     waited: int = 0  # decisions since then, or since it was stuck
 
@@ -160,6 +157,7 @@ class PredictiveControl:
         self._effort = Effort(turn, wait, either, circle)
         reach = limits.fast * (steps * body.time_step + 0.5 * limits.fast / limits.acceleration)
         half = math.ceil((reach + 0.1) / CELL)
+        self._reach = reach + 2.0 * _MOVED
         self._rooms = np.empty((2 * half + 1, 2 * half + 1))
         # Set last: what was rejected is rejected again.
         self._keep = keep
@@ -202,17 +200,13 @@ class PredictiveControl:
         if stuck:
             self._penalize(episode, pose)
         target = _cell(goal, levels.shape)
-        if stuck or target != episode.target or not np.array_equal(levels, episode.levels):
+        moved = math.dist(pose[:2], episode.found_at) > _MOVED
+        changed = target != episode.target or not np.array_equal(levels, episode.levels)
+        if stuck or moved or changed:
             episode.levels, episode.target = levels.copy(), target
-            episode.lengths = path_lengths(
-                np.minimum(_FACTORS[levels] + episode.raised, _FACTORS[BLOCKED]),
-                np.array([target]),
-                np.zeros(1),
-                MOVES,
-                _STEP,
-                math.inf,
-                buckets=_BUCKETS,
-            )
+            here, reach = _cell(pose, levels.shape), math.ceil(self._reach / RESOLUTION)
+            episode.lengths = cost_to_go(levels, episode.raised, target, here, reach)
+            episode.found_at = pose[:2]
         least = least_room(near, self._body)
         field = self._rooms[None], episode.levels, episode.lengths
         return PlanningState(pose, seen[3], points, counts, keep.body, least, *field, goal)
