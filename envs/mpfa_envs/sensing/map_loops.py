@@ -88,7 +88,7 @@ def enter_scans(
                 reach = ranges[robot, ray] / resolution
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
-                changed |= _enter(levels, from_u + reach * across, from_v + reach * up, bounds)
+                changed |= enter_hit(levels, from_u + reach * across, from_v + reach * up, bounds)
         x, y, heading = motions[robot, 0], motions[robot, 1], motions[robot, 2]
         cosine, sine = math.cos(heading), math.sin(heading)
         u = (x - maps.origins[robot, 0]) / resolution
@@ -118,7 +118,7 @@ def cell_of(place: float, count: int) -> int:
 
 
 @njit
-def _enter(
+def enter_hit(
     levels: NDArray[np.uint8], u: float, v: float, bounds: tuple[float, float, float]
 ) -> bool:
     """Enter a point that the lidar hit; return True if the map has changed."""

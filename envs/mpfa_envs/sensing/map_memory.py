@@ -50,6 +50,20 @@ class KnownMap(NamedTuple):
     """Side of a cell [m]."""
 
 
+def clearances_of(
+    plan: World,
+    pose: tuple[float, float, float],
+    origin: NDArray[np.float64],
+    shape: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Distances of a grid's cells from what a plan at a pose has [m], ``[columns, rows]``."""
+    cells = np.indices(shape).reshape(2, -1).T
+    x, y = (origin + RESOLUTION * cells - pose[:2]).T
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    points = np.stack((x * cosine + y * sine, y * cosine - x * sine), axis=1)
+    return plan.clearances(points).reshape(shape)
+
+
 class MapMemory:
     """A map for each of many robots, empty when an episode begins, or as a plan says.
 
@@ -97,6 +111,11 @@ class MapMemory:
         self._lengths = RESOLUTION, *bounds, lidar.max_range
         self._mount = lidar.mount
 
+    @property
+    def bounds(self) -> tuple[float, float, float]:
+        """Distances from a hit up to which cells are blocked, tight and near [m]."""
+        return self._lengths[1:4]
+
     def begin(
         self,
         index: int,
@@ -123,11 +142,7 @@ class MapMemory:
         arrays.levels[index] = 0
         arrays.costs[index] = UNKNOWN
         if plan is not None:
-            cells = np.indices(sides).reshape(2, -1).T
-            x, y = (arrays.origins[index] + RESOLUTION * cells - pose[:2]).T
-            cosine, sine = math.cos(pose[2]), math.sin(pose[2])
-            points = np.stack((x * cosine + y * sine, y * cosine - x * sine), axis=1)
-            clearance = plan.clearances(points).reshape(sides)
+            clearance = clearances_of(plan, pose, arrays.origins[index], (sides[0], sides[1]))
             levels[index, : sides[0], : sides[1]] = sum(
                 (clearance <= bound).astype(np.uint8) for bound in self._lengths[1:4]
             )
