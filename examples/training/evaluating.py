@@ -20,8 +20,9 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
 from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
 from mpfa_envs.robots.model import RobotModel
@@ -30,7 +31,7 @@ from mpfa_envs.safety.filter import CLEARANCE
 from training.files import short_name
 from training.worlds import worlds_label
 
-_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot")
+_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot", "team", "right_of_way")
 """Conditions that an evaluation has no entry of where they are as in the training."""
 Drivable = Policy | MapPlanner | DynamicWindow | PredictiveControl | Filtered
 """Drivers of a robot, with the ``env_arguments`` that they need."""
@@ -73,10 +74,16 @@ class Conditions:
     latency: float | None = None
     """Time from a scan to the moment at which the wheels take the order [s]."""
     filtered: bool = False
+    approach: float = 0.0
+    """Speed of what may come, before which the filter has the robot stand [m/s]."""
     robot: RobotModel | None = None
     """Another robot than that of the training."""
     task: Mapping[str, Any] = field(default_factory=dict)
     """``plan`` and ``goal_radius``, where they are others than in the training."""
+    team: int = 1
+    """Robots in a world."""
+    right_of_way: bool = False
+    """True if robots wait for those of a lower number."""
 
     @property
     def folder(self) -> str:
@@ -90,8 +97,11 @@ class Conditions:
         parts = [
             f"evaluation-{worlds_label(self.words)}-{self.physics}",
             "-filter" if self.filtered else "",
+            f"-approach{self.approach:g}" if self.approach else "",
             f"-{self.robot.name}" if self.robot is not None else "",
             *(f"-{name}-{value}" for name, value in self.task.items()),
+            f"-team{self.team}" if self.team > 1 else "",
+            "-right-of-way" if self.right_of_way else "",
             f"-seed{self.seed}" if self.seed else "",
             *(f"-{name}{value:g}" for name, value in errors.items() if value),
         ]
@@ -103,14 +113,21 @@ class Conditions:
         errors = {"noise": self.noise, "latency": self.latency}
         return {**errors, "physics": self.physics, **self.task}
 
+    @property
+    def filter_arguments(self) -> dict[str, float]:
+        """Arguments of the filter; those that are off are left out."""
+        return {"clearance": CLEARANCE} | ({"approach": self.approach} if self.approach else {})
+
     def as_json(self) -> dict[str, Any]:
         """Return the entries of ``settings.json``; what is as in the training has none."""
         tasks = {"episodes": self.episodes, "seed": self.seed, "physics": self.physics}
         others = {
-            "filter": {"clearance": CLEARANCE} if self.filtered else None,
+            "filter": self.filter_arguments if self.filtered else None,
             "noise": self.noise and asdict(self.noise),
             "latency": self.latency,
             "robot": self.robot and asdict(self.robot),
+            "team": self.team if self.team > 1 else None,
+            "right_of_way": self.right_of_way or None,
         }
         document = {"words": list(self.words), **tasks, **self.task}
         return document | {name: value for name, value in others.items() if value is not None}
@@ -145,9 +162,10 @@ def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
     return moved
 
 
-def filtered(policy: Drivable, **env_arguments: Any) -> Filtered:
+def filtered(policy: Drivable, *, approach: float = 0.0, **env_arguments: Any) -> Filtered:
     """Put a policy behind the filter that keeps the robot off obstacles that its lidar sees."""
-    return Filtered(policy, TaskConfig(**policy.env_arguments | env_arguments).make_filter())
+    config = TaskConfig(**policy.env_arguments | env_arguments)
+    return Filtered(policy, config.make_filter(approach=approach))
 
 
 def needs_filter(policy: Drivable) -> bool:

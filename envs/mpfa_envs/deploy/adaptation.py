@@ -117,11 +117,19 @@ def body_of(learned: RobotModel, robot: RobotModel, pace: float) -> RobotModel:
 
 
 def filter_of(
-    card: Card, robot: RobotModel, body: RobotModel, clearance: float | None
+    card: Card,
+    robot: RobotModel,
+    body: RobotModel,
+    clearance: float | None,  # [m]
+    approach: float = 0.0,  # of what may come, in the policy's units of time [m/s]
 ) -> SafetyFilter | None:
     """The filter of the task that a policy learned, for the robot that drives; None: no filter."""
     learned = card.robot
     if clearance is None:
+        if approach:
+            raise ValueError(
+                f"approach must be 0 without a filter (clearance=None), got {approach}"
+            )
         return None
     if not learned.can_stop:
         raise ValueError(
@@ -130,7 +138,7 @@ def filter_of(
             f"nothing, got {clearance}"
         )
     check_view(robot, robot.field_of_view)
-    repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
+    repeat = card.action_repeat * _PARTS
     rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
     return SafetyFilter(
         body,
@@ -144,6 +152,7 @@ def filter_of(
         action_repeat=repeat,
         clearance=clearance,
         braking=STRENGTH,
+        approach=approach,
     )
 
 
@@ -161,11 +170,12 @@ def nearest_admissible(
     robot: RobotModel,  # of the policy
     states: NDArray[np.float32],  # observations that the filter allows for, [S, O]
     wheels: tuple[float, float],  # speeds [m/s]
+    age: float,  # of what is seen when the speeds are ordered [s]
 ) -> tuple[float, float]:
     """Speeds of the wheels nearest to those wanted that the filter allows [m/s]."""
     slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
     action = (2.0 * np.array(wheels, np.float32) - slow - fast) / (fast - slow)
-    return robot.wheel_speeds(keep.among(states, action))
+    return robot.wheel_speeds(keep.among(states, action, age=age))
 
 
 def cannot_turn(robot: RobotModel) -> ScanError:

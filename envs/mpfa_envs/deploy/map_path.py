@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
+    from mpfa_envs.sensing.map_loops import MapArrays
 
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
@@ -167,6 +168,18 @@ class MapPath:
         self._hits.lower(self._memory.arrays.levels[0], self._planned, cells, self._memory.bounds)
         # Paths may be cheaper now.
         self.look_again()
+
+    @property
+    def arrays(self) -> MapArrays:
+        """The map, which changes with each scan, in the frame of the odometry."""
+        arrays = self._memory.arrays
+        return arrays._replace(origins=arrays.origins + self._center)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Its columns and rows."""
+        columns, rows = self._memory.arrays.shapes[0].tolist()
+        return columns, rows
 
     def look_again(self) -> None:
         """The goal or the map is another one: no path is known."""

@@ -265,14 +265,15 @@ class TaskConfig:
                 f"lidar must hold arguments of Lidar, got {self.lidar!r}: {error}"
             ) from error
 
-    def make_filter(self, *, clearance: float = CLEARANCE) -> SafetyFilter:
+    def make_filter(self, *, clearance: float = CLEARANCE, approach: float = 0.0) -> SafetyFilter:
         """Make the filter that keeps the robot off what its lidar sees.
 
         Args:
             clearance: Clearance of the rim to be kept [m].
+            approach: Speed at which things may come, before which the robot stands [m/s].
 
         Raises:
-            ValueError: If it is negative.
+            ValueError: If one is negative, or the robot cannot stop before what comes.
         """
         lidar = self.make_lidar()
         return SafetyFilter(
@@ -286,6 +287,8 @@ class TaskConfig:
             time_step=self.time_step,
             action_repeat=self.action_repeat,
             clearance=clearance,
+            approach=approach,
+            latency=self.latency[1],
         )
 
     def make_mirror(self, *, pairs: WheelPairs | None = None) -> RandomMirror:

@@ -33,9 +33,10 @@ class PlanningState(NamedTuple):
     """What a robot knows when it decides; places are in meters from the first cell of its map."""
 
     pose: tuple[float, float, float]  # x, y, heading [m, m, rad]
-    speeds: NDArray[np.float64]  # of the wheels [m/s], [1, 2]
-    points: NDArray[np.float64]  # what the filter sees, [1, P, 3]
-    counts: NDArray[np.int64]  # the number of these points, [1]
+    speeds: NDArray[np.float64]  # of the wheels in each state it may be in [m/s], [S, 2]
+    points: NDArray[np.float64]  # what the filter sees, [S, P, 4]
+    counts: NDArray[np.int64]  # the number of these points, [S]
+    kept: Body  # as the filter tests what begins a plan
     least: float  # room that the filter asks for [m]
     rooms: NDArray[np.float64]  # room in cells around the robot, at most ROOMY [m], [1, n, n]
     levels: NDArray[np.uint8]  # its map, [columns, rows]
@@ -54,7 +55,7 @@ class Effort(NamedTuple):
 
 @njit
 def room_around(
-    points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [P, 3]
+    points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [P, 4]
     heading: float,  # of the robot [rad]
     rooms: NDArray[np.float64],  # [n, n]
 ) -> None:
@@ -63,6 +64,8 @@ def room_around(
     middle, last = rooms.shape[0] // 2, rooms.shape[0] - 1
     cosine, sine = math.cos(heading) / CELL, math.sin(heading) / CELL
     for point in range(points.shape[0]):
+        if points[point, 2] == 0.0:  # Nothing stands there.
+            continue
         x, y, kept = points[point, 0], points[point, 1], math.sqrt(points[point, 2])
         u, v = middle + x * cosine - y * sine, middle + x * sine + y * cosine
         wide = (kept + ROOMY) / CELL
@@ -231,7 +234,7 @@ def _better(
     if time >= best:
         return best
     first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
-    if room_after(first, state.speeds, state.points, state.counts, body) <= state.least:
+    if room_after(first, state.speeds, state.points, state.counts, state.kept) <= state.least:
         return best
     chosen[:] = trial
     return time

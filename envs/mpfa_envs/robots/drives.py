@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 STRENGTH: Final = 0.8
 """Share of their acceleration that a real robot's wheels have at least."""
-_OFF: Final = 0.05
+OFF: Final = 0.05
 """Error that the latency of a real robot may have [s]."""
 _TIME_STEP: Final = 0.02
 """Time for which a real wheel's speed is taken as constant [s]."""
@@ -62,8 +62,8 @@ class Orders:
             slow = limits._replace(
                 acceleration=STRENGTH * limits.acceleration, turning=STRENGTH * limits.turning
             )
-            early, quick = max(latency - _OFF, 0.0), limits._replace(turning=math.inf)
-            assumed += [(latency + _OFF, slow), (early, quick)]
+            early, quick = max(latency - OFF, 0.0), limits._replace(turning=math.inf)
+            assumed += [(latency + OFF, slow), (early, quick)]
         rows = [
             self.ahead(motion, since=now - age, until=now + late, latency=late, limits=limits)
             for late, limits in assumed

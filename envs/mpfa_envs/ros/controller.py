@@ -265,7 +265,13 @@ class Controller:
             taken = self._odometry.pose_at(reading.time)
             age = max(now - odometry.time, 0.0)
             self._command = self.pilot.decide(
-                reading.scan, odometry.pose, odometry.speeds, scan_pose=taken, time=now, age=age
+                reading.scan,
+                odometry.pose,
+                odometry.speeds,
+                scan_pose=taken,
+                time=now,
+                age=age,
+                scan_age=max(now - reading.time, 0.0),
             )
             self._decided = now
             self._look_for_path(odometry, now)

@@ -25,6 +25,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "silent": "reject",
     "map_size": 40.0,
     "clearance": -1.0,
+    "approach": 0.0,
     "latency": -1.0,
     "goal_radius": 0.0,
     "goal_heading": True,
@@ -60,6 +61,7 @@ def make_controller(value: Callable[[str], Any]) -> Controller:
         silent=value("silent"),
         map_size=value("map_size"),
         clearance=_clearance(value("clearance"), card),
+        approach=value("approach"),
         latency=None if value("latency") < 0.0 else value("latency"),
         goal_radius=value("goal_radius") or None,
     )

@@ -57,10 +57,15 @@ class SafetyFilter:
         samples: Speeds of each wheel among which to find another action.
         braking: Share of the wheels' acceleration with which they slow down at least. Below 1 the
             robot's file is not exact, and it may turn more quickly than its ``turn_acceleration``.
+        approach: Speed at which whatever is seen, or hidden by that, may come [m/s]: the robot
+            stands before it could be touched by it. 0: nothing moves.
+        latency: Time from what an observation shows to the moment at which an action begins [s], in
+            which things may come nearer.
 
     Raises:
         ValueError: If a number is out of its range, the robot can stop and sees less than 180
-            degrees, or it takes farther than it sees to stand still.
+            degrees, it takes farther than it sees to stand still, or things may come and it cannot
+            stop.
 
     Examples:
         >>> import numpy as np
@@ -91,6 +96,8 @@ class SafetyFilter:
         clearance: float = CLEARANCE,
         samples: int = 9,
         braking: float = 1.0,
+        approach: float = 0.0,
+        latency: float = 0.0,
     ) -> None:
         self.robot = resolve_robot(robot)
         self._parts = observation_slices(sectors, memory=memory, history=history)
@@ -121,8 +128,16 @@ class SafetyFilter:
             check_count("action_repeat", action_repeat),
             check_positive("braking", check_share("braking", braking)),
             limits if braking == 1.0 else limits._replace(turning=math.inf),
+            check_not_negative("approach", approach),
+            check_not_negative("latency", latency),
+            len(unseen),
         )
         """Sizes, limits and time steps, as compiled loops read them."""
+        if approach and not self.robot.can_stop:
+            raise ValueError(
+                f"approach must be 0 for {self.robot.name}, which cannot stop before what comes, "
+                f"got {approach}"
+            )
         reach = _reach(self.body) + math.hypot(*mount)
         if self.robot.can_stop and reach > self._max_range:
             raise ValueError(
@@ -151,13 +166,19 @@ class SafetyFilter:
         return self.among(seen[..., None, :] if seen.ndim else seen, action)
 
     def among(
-        self, observations: NDArray[np.float32], action: NDArray[np.float32]
+        self,
+        observations: NDArray[np.float32],
+        action: NDArray[np.float32],
+        *,
+        age: float | None = None,
     ) -> NDArray[np.float32]:
         """Filter actions of robots that may be in any of some states.
 
         Args:
             observations: Observations in each of the states, ``[..., S, O]``.
             action: What the policy would do, ``[..., 2]``.
+            age: Time from what they show to the moment at which the action begins at the latest
+                [s]; None: the latency.
 
         Returns:
             The actions that may be carried out in all states, ``[..., 2]``, float32.
@@ -185,7 +206,7 @@ class SafetyFilter:
             self._origins,
             self._wheel_speeds(rows).reshape(len(actions), -1, 2),
             self._candidates,
-            self.body,
+            self.body if age is None else self.body._replace(age=age),
             chosen,
         )
         changed = (chosen != actions).any(axis=1)
@@ -271,7 +292,8 @@ def _reach(body: Body) -> float:
     fastest = max(abs(body.limits.slow), abs(body.limits.fast))
     braking = body.braking * body.limits.acceleration
     time = body.repeat * body.time_step + 0.5 * fastest / braking
-    return fastest * time + body.radius + body.clearance
+    comes = body.approach * (body.age + body.repeat * body.time_step + fastest / braking)
+    return fastest * time + comes + body.radius + body.clearance
 
 
 def _candidates(samples: int, body: Body) -> NDArray[np.float64]:

@@ -32,6 +32,12 @@ class Body(NamedTuple):
     """Share of its acceleration with which the robot slows down at least."""
     quick: WheelLimits
     """Limits of a robot that turns more quickly than it says; else the same as its limits."""
+    approach: float
+    """Speed at which what is seen, or hidden behind that, may come [m/s]."""
+    age: float
+    """Time from what is seen to the moment at which an action begins [s]."""
+    unseen: int
+    """Rays, the last ones, in directions where the lidar does not look."""
 
 
 _PARTS = 2
@@ -48,6 +54,14 @@ _TURNS = 0.1
 than stopping: with equal weights it stands before walls."""
 _GAIN = 0.001
 """Clearance that a robot gains at least that is ordered away from what is too near [m]."""
+_BORDER = 40
+"""Places on the border between what is seen and what a nearer obstacle beside it hides."""
+_APART = 0.05
+"""Distance between such places at least [m]: the robot comes 2 mm nearer to the middle of two."""
+_STANDS = 1e-6
+"""Forward speed below which a robot stands, or turns on the spot [m/s]."""
+_DIP = 0.003
+"""By how much the distance may be below that of the tested places, in time and on borders [m]."""
 _TOUCH = 1e-9
 """Rounding of distances [m]."""
 _AT_RIM = 1e-6
@@ -74,7 +88,8 @@ def filter_actions(
     wanted = np.empty_like(actions)
     scale_actions(actions, body.limits, wanted)
     states = ranges.shape[1]
-    points, counts = np.empty((states, ranges.shape[2], 3)), np.empty(states, np.int64)
+    points = np.empty((states, room_for_points(ranges.shape[2], body.approach), 4))
+    counts = np.empty(states, np.int64)
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         _choose(chosen, robot, actions, robot)
@@ -135,12 +150,18 @@ def least_room(points: NDArray[np.float64], body: Body) -> float:
 
 
 @njit
+def room_for_points(rays: int, approach: float) -> int:
+    """Number of points that :func:`see` may write for a state."""
+    return rays * (1 + _BORDER) if approach > 0.0 else rays
+
+
+@njit
 def see(
     # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
     seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     body: Body,
     creep: float,
-    points: NDArray[np.float64],  # [S, R, 3]
+    points: NDArray[np.float64],  # [S, P, 4]
     counts: NDArray[np.int64],  # [S]
 ) -> None:
     """Write the near points of each state and their numbers."""
@@ -159,7 +180,8 @@ def _near_points(
     speeds: NDArray[np.float64],
     body: Body,
     creep: float,  # share that may be taken of a clearance below the least
-    points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
+    # x, y, the squared distance to be kept from it [m], and 1 if it may come, else 0, [P, 4]
+    points: NDArray[np.float64],
 ) -> int:
     """Write the points that the robot may reach before it stands; their number."""
     fastest = max(abs(body.limits.slow), abs(body.limits.fast), abs(speeds[0]), abs(speeds[1]))
@@ -169,6 +191,9 @@ def _near_points(
     else:
         reach += 0.5 * fastest * fastest / (body.braking * body.limits.acceleration)
     kept = body.radius + body.clearance
+    if body.approach > 0.0:
+        stops = body.repeat * body.time_step + fastest / (body.braking * body.limits.acceleration)
+        reach += body.approach * (body.age + stops) + _DIP
     count = 0
     for ray in range(ranges.shape[0]):
         x = origins[0, ray] + ranges[ray] * directions[0, ray]
@@ -187,7 +212,44 @@ def _near_points(
             touch = _TOUCH if room > _AT_RIM else _AT_RIM
             distance = min(away, kept, body.radius + left) - touch
             points[count, 2] = distance * distance
+            comes = body.approach > 0.0 and ray < ranges.shape[0] - body.unseen
+            points[count, 3] = 1.0 if comes else 0.0
             count += 1
+    if body.approach > 0.0:
+        seen = ranges[: ranges.shape[0] - body.unseen]
+        count = _add_borders(
+            seen, directions, origins, body.unseen == 0, reach + kept, points, count
+        )
+    return count
+
+
+@njit
+def _add_borders(
+    ranges: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    origins: NDArray[np.float64],
+    around: bool,  # True if the last ray is beside the first
+    reach: float,  # within which places count [m]
+    points: NDArray[np.float64],
+    count: int,  # of points so far
+) -> int:
+    """Add places beside nearer obstacles, from where what they hide may come; all their number."""
+    apart = max(_APART, 2.0 * reach / _BORDER)
+    for ray in range(ranges.shape[0]):
+        far = min(ranges[ray], reach + math.hypot(origins[0, ray], origins[1, ray]))
+        for side in (-1, 1):
+            beside = (ray + side) % ranges.shape[0]
+            near = ranges[beside]
+            if near >= far or not (around or abs(ray - beside) == 1):
+                continue
+            steps = min(math.ceil((far - near) / apart), _BORDER // 2)
+            for step in range(1, steps):
+                away = near + step * apart
+                points[count, 0] = origins[0, ray] + away * directions[0, ray]
+                points[count, 1] = origins[1, ray] + away * directions[1, ray]
+                # Nothing stands there: only what moves has to be kept off.
+                points[count, 2], points[count, 3] = 0.0, 1.0
+                count += 1
     return count
 
 
@@ -195,7 +257,7 @@ def _near_points(
 def room_after(
     command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
     speeds: NDArray[np.float64],  # in each state [m/s], [S, 2]
-    points: NDArray[np.float64],  # [S, R, 3]
+    points: NDArray[np.float64],  # [S, P, 4]
     counts: NDArray[np.int64],  # of the points, [S]
     body: Body,
 ) -> float:
@@ -214,7 +276,7 @@ def room_after(
 def _room_after_from(
     command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
     speeds: NDArray[np.float64],  # now [m/s], [2]
-    points: NDArray[np.float64],  # [P, 3]
+    points: NDArray[np.float64],  # [P, 4]
     body: Body,
     limits: WheelLimits,
 ) -> float:
@@ -223,7 +285,7 @@ def _room_after_from(
     It can if it stands still in time or, where it cannot stand still, if a full circle is free.
     """
     left, right = speeds[0], speeds[1]
-    x, y, heading = 0.0, 0.0, 0.0
+    x, y, heading, passed = 0.0, 0.0, 0.0, body.age
     step = 0
     while step < body.repeat or (limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
         wanted = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
@@ -235,9 +297,16 @@ def _room_after_from(
             x += along * math.cos(heading + 0.5 * turn)
             y += along * math.sin(heading + 0.5 * turn)
             heading += turn
+            passed += part
+            # The square of the distance within which it could be touched while it drives.
+            nearest = 0.0
+            if body.approach > 0.0 and abs(left + right) > 2.0 * _STANDS:
+                nearest = (body.radius + body.approach * passed + _DIP) ** 2
             for point in range(points.shape[0]):
                 across, ahead = points[point, 1] - y, points[point, 0] - x
-                if across * across + ahead * ahead < points[point, 2]:
+                if across * across + ahead * ahead < max(
+                    points[point, 2], nearest * points[point, 3]
+                ):
                     return -1.0
         step += 1
     if limits.slow <= 0.0:
