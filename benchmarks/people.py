@@ -33,7 +33,7 @@ from mpfa_envs import (
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.driver import Filtered
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.robots.resolve import resolve_robot

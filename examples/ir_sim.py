@@ -278,12 +278,23 @@ def main(arguments: Sequence[str] | None = None) -> list[Drive]:
         "--behavior", choices=["rvo", "dash"], default="rvo", help="of walkers (default: rvo)"
     )
     parser.add_argument("--clearance", type=float, default=0.02, help="[m] (default: 0.02)")
+    parser.add_argument(
+        "--approach",
+        type=float,
+        default=0.0,
+        help="speed of walkers before which the robot stands [m/s] (default: 0)",
+    )
     parser.add_argument("--picture", type=Path, help="file for the paths in the first world")
     options = parser.parse_args(arguments)
     drives = []
     with tempfile.TemporaryDirectory() as folder:
         policy = export_policy(load_policy(options.policy), Path(folder) / "policy.onnx")
-        pilot = Pilot.load(policy, clearance=options.clearance, latency=options.latency)
+        pilot = Pilot.load(
+            policy,
+            clearance=options.clearance,
+            approach=options.approach,
+            latency=options.latency,
+        )
     tasks = world_tasks(options.worlds, episodes=options.episodes, robot=pilot.robot)
     for number, each in enumerate(tasks):
         crowd = {"walkers": options.walkers, "behavior": options.behavior, "seed": number}

@@ -20,8 +20,9 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
 from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
 from mpfa_envs.robots.model import RobotModel

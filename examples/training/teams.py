@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.evaluation.results import EpisodeResult, wilson
 from mpfa_envs.evaluation.right_of_way import RightOfWay
-from mpfa_envs.evaluation.runs import as_driver
 from mpfa_envs.evaluation.teams import TeamResult, Trail, run_teams
 from mpfa_envs.tasks.teams import TEAM_WORLDS, TeamTask, team_tasks
 from training.evaluating import Conditions, Drivable
@@ -66,7 +66,9 @@ def drive_teams(
 
     robot = driver.env_arguments.get("robot", "turtlebot2")
     arguments = {**driver.env_arguments, **asked.arguments}
-    chosen = RightOfWay(as_driver(driver)) if asked.right_of_way else driver
+    chosen: Action | Driver = driver
+    if asked.right_of_way:
+        chosen = RightOfWay(as_driver(driver), robot, asked.team)
     shown: list[tuple[TeamTask, list[Trail], list[EpisodeResult]]] = []
     results: list[TeamResult] = []
     rows: list[dict[str, Any]] = []

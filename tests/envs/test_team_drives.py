@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Task
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.right_of_way import RightOfWay
-from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.evaluation.teams import run_teams, stood
 from mpfa_envs.planners import make_planner
 from mpfa_envs.tasks.teams import TEAM_WORLDS, TeamTask, team_tasks
@@ -89,7 +89,7 @@ def test_robots_that_wait_by_their_numbers_pass_a_lane_in_which_others_meet():
     keep = Filtered(planner, make_filter(task))
     tasks = team_tasks("lane", 2, episodes=2, robot="kobuki")
     assert not any(each.success for each in run_teams(keep, tasks, **task))
-    waiting = run_teams(RightOfWay(keep), tasks, **task)
+    waiting = run_teams(RightOfWay(keep, "kobuki", 2), tasks, **task)
     assert all(each.success and not each.touched for each in waiting)
 
 

@@ -1,4 +1,4 @@
-"""From scan, odometry and goal to wheel speeds: one decision of an exported policy."""
+"""From scan, odometry and goal to wheel speeds: one decision of a policy, or of a planner."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from mpfa_envs.deploy.adaptation import (
     reject_blind_front,
     tolerance,
 )
+from mpfa_envs.deploy.asked import Asked
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import pair_of
 from mpfa_envs.robots.drives import OFF, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.safety.filter import SafetyFilter
+    from mpfa_envs.driver import Action, Driver
     from mpfa_envs.worlds.world import World
 
 _TOWARDS: Final = math.radians(45.0)
@@ -54,7 +55,7 @@ class Command(NamedTuple):
 
 
 class Pilot:
-    """Runs a policy on a robot: NumPy and onnxruntime, and Numba if the policy has a map.
+    """Runs a policy or a planner on a robot: NumPy and onnxruntime, and Numba if it has a map.
 
     A slower robot than that of the training drives the same arcs at a slower pace p: its decisions
     come later and its speeds are read as if it were the other one. Speeds are p times as large and
@@ -65,7 +66,9 @@ class Pilot:
 
     Args:
         card: Of the policy.
-        network: From observations ``[1, O]`` to actions ``[1, 2]``.
+        driver: From observations ``[1, O]`` to actions ``[1, 2]``, or a
+            :class:`~mpfa_envs.driver.Driver`, which drives robot 0.
+            :func:`~mpfa_envs.planners.make_pilot` makes a pilot of a planner.
         robot: What drives, as any environment takes it; None: the robot that the policy learned
             with.
         pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can, so
@@ -78,8 +81,7 @@ class Pilot:
             position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
-        approach: Speed of what may come [m/s]: the filter has the robot stand before such a thing,
-            seen or hidden by what is seen, could touch it. Walls are such things, too.
+        approach: Speed of what may come, walls too, before which the filter has it stand [m/s].
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot drives the orders under way first, and
             decides for the state that it comes to; its filter allows for an error of 0.05 s, and
@@ -97,7 +99,7 @@ class Pilot:
     def __init__(
         self,
         card: Card,
-        network: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        driver: Action | Driver,
         *,
         robot: RobotChoice | None = None,
         pace: float | None = None,
@@ -119,7 +121,6 @@ class Pilot:
         self.sectors = Sectors(
             card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
         )
-        self._network = network
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
@@ -127,6 +128,8 @@ class Pilot:
         self._body = body_of(card.robot, self.robot, self.pace)
         self._approach = check_not_negative("approach", approach)
         self._keep = self._filter(clearance)
+        self._asked = Asked(driver, card, self._ground, self._make_filter)
+        self._planned: SafetyFilter | None = None
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -306,7 +309,7 @@ class Pilot:
             ScanError: If the scan lacks the range of a sector.
             ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
-        return self._observe(scan, pose, speeds, scan_pose, time, age)[0]
+        return self._observe(scan, pose, speeds, scan_pose, time, age)[0][0]
 
     def _observe(
         self,
@@ -316,8 +319,8 @@ class Pilot:
         scan_pose: tuple[float, float, float] | None,
         time: float | None,
         age: float,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
+        """Observations that the filter allows for, ``[S, O]``; their states; the turn till then."""
         if self.goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
@@ -331,13 +334,15 @@ class Pilot:
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
         self._ground.check_at((x, y))
+        if self._ground.begins:
+            self._asked.begin()
         ranges, points = self.sectors.read(scan)
         path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
         facts = self.goal, self._ground.is_new, path, self.pace
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
         self._ground.is_new = False
-        return rows[0], rows, float(ahead[0, 2] - taken[2])
+        return rows, ahead, float(ahead[0, 2] - taken[2])
 
     def give(self, time: float, linear: float, angular: float) -> None:
         """Remember what was ordered, where that is not what the pilot has decided.
@@ -363,7 +368,7 @@ class Pilot:
         """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
 
         Args:
-            scan: What the lidar has measured.
+            scan: As there.
             pose: As there.
             speeds: As there.
             scan_pose: As there.
@@ -380,12 +385,14 @@ class Pilot:
         if not self.arrived(pose) and self._arrival.turns:
             self._time = self._time + self.period if time is None else check_number("time", time)
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
-        observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
+        rows, ahead, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        slower = math.inf if self.goal is None else self._arrival.fastest(pose, self.goal)
-        action = self._network(observation[None])[0]
-        if not np.isfinite(action).all():
-            raise ValueError(f"the network's action must be finite, got {action}")
+        goal = self._ground.goal or pose[:2]
+        slower = self._arrival.fastest(pose, goal)
+        # Whatever the policy reads in them, sectors that are not seen begin at the rim.
+        states = rows.copy()
+        states[:, : self.card.sectors][:, hidden] = 1.0
+        action = self._asked.act(rows, states, ahead, goal, self.goal_radius)
         learned = self.card.robot
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
         back = self._way_back.speeds(pose, self._time, reverses=reverses)
@@ -402,13 +409,17 @@ class Pilot:
             left = -right
         if self._keep is not None:
             reject_blind_front(blind)
-            # Whatever the policy reads in them, sectors that are not seen begin at the rim.
-            states[:, : self.card.sectors][:, hidden] = 1.0
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
             left, right = nearest_admissible(self._keep, learned, states, (left, right), old)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
+
+    def _make_filter(self) -> SafetyFilter:
+        """The filter of this pilot, or the one that it would have."""
+        made = self._planned = self._keep or self._planned or self._filter(CLEARANCE)
+        assert made is not None
+        return made
 
     def _command(self, linear: float, angular: float) -> Command:
         """The command for speeds of the body [m/s, rad/s]."""

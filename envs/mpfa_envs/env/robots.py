@@ -300,6 +300,10 @@ class RobotBatch:
         seen = self.walkers.without(motions, self._lidar, self.ranges)
         return np.concatenate((motions[:, :2], sizes, held, here[:, :3], seen), axis=1)
 
+    def measured(self) -> NDArray[np.float64]:
+        """Motions by odometry when the next orders act, ``[N, 5]``."""
+        return self._motions()[1]
+
     def _motions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """By odometry, motions now and when the next orders act, ``[N, 5]``."""
         here = self.episodes.motions if self.noise is None else self.noise.odometry

@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.runs import Driver
+from mpfa_envs.driver import Driver, Errand, Senses
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.worlds.world import World
 
 _STEP: Final = 0.1
 """Distance between the points of a path [m]."""
@@ -35,71 +36,68 @@ class RightOfWay:
 
     Args:
         driver: Of each robot.
+        robot: What they are.
+        team: Robots of a team; their numbers follow each other.
     """
 
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
+    def __init__(self, driver: Driver, robot: RobotChoice, team: int) -> None:
+        self._driver, self._robot, self._team = driver, resolve_robot(robot), team
+        self._worlds: dict[int, World] = {}
+        self._period = 0.0
         self._paths: dict[int, NDArray[np.float64]] = {}
         self._places: dict[int, tuple[float, float]] = {}
         self._stood: dict[int, float] = {}
         self._grids: dict[int, FreeGrid] = {}
 
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+    def begin(self, robot: int, errand: Errand) -> None:
         """Plan the path of a robot, and prepare its driver."""
-        self._driver.begin(env, robot)
-        task, world = env.tasks[robot], env.worlds[robot]
-        if task is None:
-            raise ValueError(f"tasks must have one for robot {robot}, got None")
+        self._driver.begin(robot, errand)
+        world, start = errand.world, errand.start[:2]
+        if world is None:
+            raise ValueError(f"world must be known for the path of robot {robot}, got None")
+        self._worlds[robot], self._period = world, errand.time_step * errand.action_repeat
         grid = self._grids.get(id(world))
         if grid is None or grid.world is not world:
-            radius = env.config.robot.radius
-            grid = self._grids[id(world)] = FreeGrid(world, distance=radius)
-        self._paths[robot] = descend(DistanceField(grid, task.goal), task.start[:2])
-        self._places[robot], self._stood[robot] = task.start[:2], 0.0
+            grid = self._grids[id(world)] = FreeGrid(world, distance=self._robot.radius)
+        self._paths[robot] = descend(DistanceField(grid, errand.goal), start)
+        self._places[robot], self._stood[robot] = start, 0.0
 
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+    def drive(self, senses: Senses) -> NDArray[np.float32]:
         """The driver's actions; those who wait stop."""
-        actions = np.array(self._driver.drive(env, robots, observations))
-        poses, period = env.poses, env.config.action_time
-        for robot in robots.tolist():
-            x, y = poses[robot, :2].tolist()
-            self._stood[robot] += period
+        actions, robots = np.array(self._driver.drive(senses)), senses.robots
+        for robot, (x, y) in zip(robots.tolist(), senses.poses[:, :2].tolist(), strict=True):
+            self._stood[robot] += self._period
             if math.dist(self._places[robot], (x, y)) > _MOVED:
                 self._places[robot], self._stood[robot] = (x, y), 0.0
             self._paths[robot] = rest_of(self._paths[robot], (x, y))
-        slow, fast = env.config.robot.min_wheel_speed, env.config.robot.max_wheel_speed
+        slow, fast = self._robot.min_wheel_speed, self._robot.max_wheel_speed
         standing = -(fast + slow) / (fast - slow)
         under_way = set(robots.tolist())
         for row, robot in enumerate(robots.tolist()):
-            first = robot // env.team * env.team
-            others = [each for each in range(first, first + env.team) if each in under_way]
-            if any(self._waits(env, robot, other) for other in others if other != robot):
+            first = robot // self._team * self._team
+            others = [each for each in range(first, first + self._team) if each in under_way]
+            if any(self._waits(robot, other) for other in others if other != robot):
                 actions[row] = standing
         return actions
 
-    def _waits(self, env: VectorNavigationEnv, robot: int, other: int) -> bool:
+    def _waits(self, robot: int, other: int) -> bool:
         """Return True if a robot lets another one pass."""
         if self._stood[other] >= _PATIENCE:
             return False
         own, others = self._paths[robot][: round(_AHEAD / _STEP)], self._paths[other]
         gaps = np.hypot(*(own[:, None] - others[None]).transpose(2, 0, 1))
-        if not (gaps < 2.0 * env.config.robot.radius + _GAP).any():
+        if not (gaps < 2.0 * self._robot.radius + _GAP).any():
             return False
-        if self._blocks(env, robot, other):
+        if self._blocks(robot, other):
             return False
-        return other < robot or self._blocks(env, other, robot)
+        return other < robot or self._blocks(other, robot)
 
-    def _blocks(self, env: VectorNavigationEnv, robot: int, other: int) -> bool:
+    def _blocks(self, robot: int, other: int) -> bool:
         """Return True if a robot is where another one has to go, and cannot be passed."""
-        place, radius = self._places[robot], env.config.robot.radius
+        place, radius = self._places[robot], self._robot.radius
         away = np.hypot(*(self._paths[other] - place).T).min()
         near = bool(away < 2.0 * radius + _GAP)
-        return near and env.worlds[robot].clearance(*place) < 3.0 * radius + _GAP
+        return near and self._worlds[robot].clearance(*place) < 3.0 * radius + _GAP
 
 
 def descend(field: DistanceField, start: tuple[float, float]) -> NDArray[np.float64]:

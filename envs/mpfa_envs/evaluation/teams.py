@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.deploy.maneuvers import STANDING_SIDE, STANDING_TIME
+from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Action, Driver, as_driver, drive_steps
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, drive_steps
 from mpfa_envs.tasks.teams import TeamTask
 
 Trail = NDArray[np.float64]

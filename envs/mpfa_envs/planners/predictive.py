@@ -20,8 +20,8 @@ from mpfa_envs.sensing.map_memory import RESOLUTION
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.env.vector import VectorNavigationEnv
+    from mpfa_envs.driver import Errand, Senses
+    from mpfa_envs.safety.filter import SafetyFilter
     from mpfa_envs.safety.loops import Body
     from mpfa_envs.sensing.map_loops import MapArrays
     from mpfa_envs.worlds.shapes import Point
@@ -61,7 +61,7 @@ class _Episode:
     """What a robot remembers during one episode."""
 
     plan: NDArray[np.float64]  # wheel speeds of the time steps ahead [m/s], [T, 2]
-    goal: Point  # [m]
+    target: tuple[int, int]  # cell of the goal to which the lengths lead
     levels: NDArray[np.uint8]  # its map when the lengths were found, [columns, rows]
     raised: NDArray[np.int64]  # by how much cells cost more since it was stuck before them
     lengths: NDArray[np.float64]  # of the cheapest paths from each cell to the goal [m]
@@ -70,7 +70,7 @@ class _Episode:
 
 
 class PredictiveControl:
-    r"""Sampling model predictive control, a :class:`~mpfa_envs.evaluation.runs.Driver`.
+    r"""Sampling model predictive control, a :class:`~mpfa_envs.driver.Driver`.
 
     It has what a policy with a map has: the sectors of the lidar, the speeds, the map of what the
     lidar hit and the pose by odometry. With late orders all of these are of the moment when the
@@ -120,31 +120,33 @@ class PredictiveControl:
         }
         """Arguments of the environments that it drives in, unless others are given. A slow robot
         holds its actions for longer, as its policies do."""
-        self._config: TaskConfig | None = None
+        self._keep: SafetyFilter | None = None
         self._episodes: dict[int, _Episode] = {}
 
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Forget the last episode of a robot.
+    def begin(self, robot: int, errand: Errand) -> None:
+        """Forget the last errand of a robot.
 
         Raises:
             ValueError: If robots have no map, or the filter cannot keep this robot off obstacles.
         """
-        maps, task = _maps(env), env.tasks[robot]
-        if task is None:
-            raise ValueError(f"robot {robot} must have begun an episode to plan for")
-        if env.config is not self._config:
-            self._prepare(env.config)
+        if errand.map_shape is None:
+            raise ValueError("memory must be 'map' for mpc, got 'none'")
+        self._prepare(errand)
         plan = np.full((self._ahead.repeat, 2), max(self._body.limits.slow, 0.0))
-        columns, rows = maps.shapes[robot]
         # No cell is on a map of this level: the lengths are found in the first decision.
-        levels = np.full((columns, rows), BLOCKED + 1, np.uint8)
-        raised = np.zeros((columns, rows), np.int64)
-        self._episodes[robot] = _Episode(plan, task.goal, levels, raised, raised.astype(float))
+        levels = np.full(errand.map_shape, BLOCKED + 1, np.uint8)
+        raised = np.zeros(errand.map_shape, np.int64)
+        self._episodes[robot] = _Episode(plan, (-1, -1), levels, raised, raised.astype(float))
 
-    def _prepare(self, config: TaskConfig) -> None:
-        """Take robot, lidar, filter and time steps from a task."""
-        self._keep = config.make_filter()
-        self._body = body = self._keep.body
+    def _prepare(self, errand: Errand) -> None:
+        """Take robot, lidar, filter and time steps from an errand."""
+        self._radius = _REACHED * errand.goal_radius
+        keep = errand.make_filter()
+        if keep is self._keep:
+            return
+        # The filter of a robot may have finer time steps than it needs to plan.
+        step, repeat = errand.time_step, errand.action_repeat
+        self._body = body = keep.body._replace(time_step=step, repeat=repeat)
         limits = body.limits
         steps = max(round(_LENGTH / limits.fast / body.time_step), 2 * body.repeat)
         self._ahead = body._replace(repeat=steps)
@@ -154,56 +156,57 @@ class PredictiveControl:
             whole = math.tau * body.wheel_base / (limits.fast - limits.slow)
             circle = math.ceil(whole / body.time_step)
         either = limits.reverse and limits.slow < -0.9 * limits.fast
-        turn, wait = _TURN / config.robot.max_angular_speed, _WAIT * _LENGTH / limits.fast
+        turn, wait = _TURN / keep.robot.max_angular_speed, _WAIT * _LENGTH / limits.fast
         self._effort = Effort(turn, wait, either, circle)
         reach = limits.fast * (steps * body.time_step + 0.5 * limits.fast / limits.acceleration)
         half = math.ceil((reach + 0.1) / CELL)
         self._rooms = np.empty((2 * half + 1, 2 * half + 1))
-        self._radius = _REACHED * config.goal_radius
         # Set last: what was rejected is rejected again.
-        self._config = config
+        self._keep = keep
 
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+    def drive(self, senses: Senses) -> NDArray[np.float32]:
         """Actions of the N robots, ``[N, 2]``, by their observations, maps and odometry."""
+        keep, maps = self._keep, senses.maps
+        if keep is None or maps is None:
+            raise ValueError("begin() must be called for each robot before drive()")
         slow, fast = self._body.limits.slow, self._body.limits.fast
         actions = []
-        for robot, observation in zip(robots.tolist(), observations, strict=True):
-            scene, plan = self._scene(env, robot, observation), self._episodes[robot].plan
+        for row, robot in enumerate(senses.robots.tolist()):
+            scene, plan = self._scene(keep, maps, senses, row), self._episodes[robot].plan
             time = best_plan(plan, self._pairs, self._noise, scene, self._body, self._effort)
             if time == math.inf:
                 plan[:] = max(slow, 0.0)
             actions.append(2.0 * (plan[0] - slow) / (fast - slow) - 1.0)
-        return self._keep(observations, np.array(actions, dtype=np.float32))
+        return keep.among(senses.states, np.array(actions, dtype=np.float32))
 
     def _scene(
-        self, env: VectorNavigationEnv, robot: int, observation: NDArray[np.float32]
+        self, keep: SafetyFilter, maps: MapArrays, senses: Senses, row: int
     ) -> PlanningState:
         """What a robot knows when it decides."""
-        episode, maps = self._episodes[robot], _maps(env)
+        robot = int(senses.robots[row])
+        episode = self._episodes[robot]
         columns, rows = episode.levels.shape
         levels, (left, low) = maps.levels[robot, :columns, :rows], maps.origins[robot].tolist()
-        x, y, heading = env.measurements[robot, 4:7].tolist()
+        x, y, heading = senses.motions[row, :3].tolist()
         pose = x - left, y - low, heading
-        goal = episode.goal[0] - left, episode.goal[1] - low, self._radius
-        seen = self._keep.seen(observation[None])
-        rays = room_for_points(seen[0].shape[1], self._body.approach)
-        points, counts = np.empty((1, rays, 4)), np.empty(1, np.int64)
+        goal_x, goal_y = senses.goals[row].tolist()
+        goal = goal_x - left, goal_y - low, self._radius
+        seen = keep.seen(senses.states[row])
+        states, rays = seen[0].shape
+        points = np.empty((states, room_for_points(rays, self._ahead.approach), 4))
+        counts = np.empty(states, np.int64)
         see(seen, self._ahead, 0.0, points, counts)
         near = points[0, : counts[0]]
         room_around(near, heading, self._rooms)
         stuck = self._is_stuck(episode, pose[:2])
         if stuck:
             self._penalize(episode, pose)
-        if stuck or not np.array_equal(levels, episode.levels):
-            episode.levels = levels.copy()
+        target = _cell(goal, levels.shape)
+        if stuck or target != episode.target or not np.array_equal(levels, episode.levels):
+            episode.levels, episode.target = levels.copy(), target
             episode.lengths = path_lengths(
                 np.minimum(_FACTORS[levels] + episode.raised, _FACTORS[BLOCKED]),
-                np.array([_cell(goal, levels.shape)]),
+                np.array([target]),
                 np.zeros(1),
                 MOVES,
                 _STEP,
@@ -211,8 +214,8 @@ class PredictiveControl:
                 buckets=_BUCKETS,
             )
         least = least_room(near, self._body)
-        field = episode.levels, episode.lengths
-        return PlanningState(pose, seen[3], points, counts, least, self._rooms[None], *field, goal)
+        field = self._rooms[None], episode.levels, episode.lengths
+        return PlanningState(pose, seen[3], points, counts, keep.body, least, *field, goal)
 
     def _is_stuck(self, episode: _Episode, place: Point) -> bool:
         """Return True once if a robot has not left its place for a while."""
@@ -236,13 +239,6 @@ class PredictiveControl:
             if max(map(abs, at)) <= half and self._rooms[half + at[0], half + at[1]] < 0.0:
                 break
         episode.raised[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] += _RAISED
-
-
-def _maps(env: VectorNavigationEnv) -> MapArrays:
-    """The robots' maps; raise an error if they have none."""
-    if env.maps is None:
-        raise ValueError(f"memory must be 'map' for mpc, got {env.config.memory!r}")
-    return env.maps
 
 
 def _cell(place: tuple[float, ...], shape: tuple[int, ...]) -> tuple[int, int]:

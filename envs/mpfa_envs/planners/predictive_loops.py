@@ -33,9 +33,10 @@ class PlanningState(NamedTuple):
     """What a robot knows when it decides; places are in meters from the first cell of its map."""
 
     pose: tuple[float, float, float]  # x, y, heading [m, m, rad]
-    speeds: NDArray[np.float64]  # of the wheels [m/s], [1, 2]
-    points: NDArray[np.float64]  # what the filter sees, [1, P, 4]
-    counts: NDArray[np.int64]  # the number of these points, [1]
+    speeds: NDArray[np.float64]  # of the wheels in each state it may be in [m/s], [S, 2]
+    points: NDArray[np.float64]  # what the filter sees, [S, P, 4]
+    counts: NDArray[np.int64]  # the number of these points, [S]
+    kept: Body  # as the filter tests what begins a plan
     least: float  # room that the filter asks for [m]
     rooms: NDArray[np.float64]  # room in cells around the robot, at most ROOMY [m], [1, n, n]
     levels: NDArray[np.uint8]  # its map, [columns, rows]
@@ -233,7 +234,7 @@ def _better(
     if time >= best:
         return best
     first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
-    if room_after(first, state.speeds, state.points, state.counts, body) <= state.least:
+    if room_after(first, state.speeds, state.points, state.counts, state.kept) <= state.least:
         return best
     chosen[:] = trial
     return time

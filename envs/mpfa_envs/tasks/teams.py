@@ -51,8 +51,9 @@ TEAM_WORLDS: Final = {
         Box(-3.0, -3.0, 3.0, -0.35),
     ),
 }
-"""Worlds for teams: a hall that all cross; two halls joined by a door, 0.7 m wide; by a lane of that
-width, 6 m long, in which a Kobuki cannot pass another; by such a lane with a bay in the middle."""
+"""Worlds for teams: a hall that all cross; two halls joined by a door, 0.7 m wide; by a lane of
+that width, 6 m long, in which a Kobuki cannot pass another; by such a lane with a bay in its
+middle."""
 
 
 class TeamTask(NamedTuple):
