@@ -171,11 +171,12 @@ def nearest_admissible(
     states: NDArray[np.float32],  # observations that the filter allows for, [S, O]
     wheels: tuple[float, float],  # speeds [m/s]
     age: float,  # of what is seen when the speeds are ordered [s]
+    still: NDArray[np.bool_] | None,  # sectors of known walls in each state, [S, sectors]
 ) -> tuple[float, float]:
     """Speeds of the wheels nearest to those wanted that the filter allows [m/s]."""
     slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
     action = (2.0 * np.array(wheels, np.float32) - slow - fast) / (fast - slow)
-    return robot.wheel_speeds(keep.among(states, action, age=age))
+    return robot.wheel_speeds(keep.among(states, action, age=age, still=still))
 
 
 def cannot_turn(robot: RobotModel) -> ScanError:

@@ -79,7 +79,8 @@ class Pilot:
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
         approach: Speed of what may come [m/s]: the filter has the robot stand before such a thing,
-            seen or hidden by what is seen, could touch it. Walls are such things, too.
+            seen or hidden by what is seen, could touch it. Walls are such things, too, but those of
+            a plan.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot drives the orders under way first, and
             decides for the state that it comes to; its filter allows for an error of 0.05 s, and
@@ -127,6 +128,7 @@ class Pilot:
         self._body = body_of(card.robot, self.robot, self.pace)
         self._approach = check_not_negative("approach", approach)
         self._keep = self._filter(clearance)
+        self._still: NDArray[np.bool_] | None = None
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -333,6 +335,7 @@ class Pilot:
         self._ground.check_at((x, y))
         ranges, points = self.sectors.read(scan)
         path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
+        self._still = self._ground.standing(ahead, taken, points) if self._approach else None
         facts = self.goal, self._ground.is_new, path, self.pace
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
@@ -406,7 +409,10 @@ class Pilot:
             states[:, : self.card.sectors][:, hidden] = 1.0
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
-            left, right = nearest_admissible(self._keep, learned, states, (left, right), old)
+            if (still := self._still) is not None:
+                still[:, hidden] = False
+            wheels = left, right
+            left, right = nearest_admissible(self._keep, learned, states, wheels, old, still)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
 

@@ -222,6 +222,10 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         """The walkers around a robot: (x, y), velocities and radii, ``[K, 5]`` [m, m/s, m]."""
         return self._batch.walkers.of(index)
 
+    def standing(self, robots: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Sectors in which robots see walls that their plan has, and nothing else, ``[N, S]``."""
+        return self._batch.standing(robots)
+
     def set_seed(self, seed: int | Sequence[int | None]) -> None:
         """Seed the episodes that begin from now on, without beginning any.
 

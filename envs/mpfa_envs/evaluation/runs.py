@@ -24,6 +24,7 @@ from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.tasks.sampling import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
@@ -129,7 +130,10 @@ class Filtered:
         observations: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """The driver's actions, filtered."""
-        return self.keep(observations, self._driver.drive(env, robots, observations))
+        actions, keep = self._driver.drive(env, robots, observations), self.keep
+        if isinstance(keep, SafetyFilter) and keep.body.approach and env.config.plan == "known":
+            return keep(observations, actions, still=env.standing(robots))
+        return keep(observations, actions)
 
 
 def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
