@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 from mpfa_envs import TaskConfig, evaluate, load_policy
-from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.driver import Filtered
 from mpfa_envs.planners import PredictiveControl
 from training.comparison.report import table
 from training.files import run_script

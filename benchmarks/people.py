@@ -35,7 +35,7 @@ from mpfa_envs import (
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.driver import Filtered
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.robots.resolve import resolve_robot
@@ -130,10 +130,10 @@ def drive_among_walkers(
         still = None
         if known:
             still = np.zeros((_ROBOTS, lidar.sectors), dtype=np.bool_)
-            for index, (pose, row) in enumerate(zip(motions[:, :3], ranges, strict=True)):
+            for k, (pose, row) in enumerate(zip(motions[:, :3], ranges, strict=True)):
                 scan, far = (pose, lidar.angles, row), lidar.max_range
-                hits = standing_hits(plans[index], (0.0, 0.0, 0.0), *scan, far)
-                still[index] = standing_sectors(hits, *scan, far, pose, view, lidar.sectors)
+                hits = standing_hits(plans[k], (0.0, 0.0, 0.0), *scan, far)
+                still[k] = standing_sectors(hits, *scan, far, pose, view, lidar.sectors)
         ranges = ranges.reshape(_ROBOTS, lidar.sectors, -1).min(axis=2)
         seen = np.zeros((_ROBOTS, size), np.float32)
         seen[:, parts["lidar"]] = near / np.maximum(ranges, near)

@@ -110,7 +110,8 @@ _SAMPLERS = ("MPFA-PER", "proportional PER", "rank-based PER", "greedy oracle", 
 
 def read_curves(table: str) -> dict[str, list[Curve]]:
     """Read the curves of the runs of a table, by arm and in the order of seeds."""
-    rows = read_table(KEPT / f"study/{table}-curves.csv.gz")
+    rows = read_table(KEPT / "study/curves.csv.gz")
+    rows = rows[rows["table"] == table]
     found: dict[str, list[Curve]] = {}
     for (arm, _), run in rows.groupby(["arm", "seed"]):
         found.setdefault(str(arm), []).append((run["total_steps"], run["success"]))

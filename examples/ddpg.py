@@ -30,7 +30,7 @@ from mpfa_envs import (
     make_navigation_env,
     save_policy,
 )
-from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.driver import Filtered
 
 SENSES: dict[str, Any] = {
     **{name: ROOMS_TASK[name] for name in ("robot", "physics", "memory")},

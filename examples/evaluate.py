@@ -7,6 +7,7 @@
     python examples/evaluate.py --policy dwa --worlds bars:validation    a planner
     python examples/evaluate.py td3-rooms --robot turtlebot4    on another robot than its own
     python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, not kept
+    python examples/evaluate.py td3-rooms --team 4 --worlds crossing     four robots in one world
 
 Prints one row per world or generator, and the total. Writes to --output; by default to
 ``evaluation-WORLDS-PHYSICS`` in the folder of the run, or, for other files and planners, in
@@ -45,6 +46,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.tasks.teams import TEAM_WORLDS
 from training import files
 from training.evaluating import (
     Conditions,
@@ -59,6 +61,8 @@ from training.evaluating import (
 )
 from training.finished import warnings_of
 from training.options import add_filter, add_plugin, add_robot, check_least
+from training.teams import add_team, drive_teams, team_worlds
+from training.teams import printed as printed_teams
 from training.worlds import parse_worlds, understood, world_name
 
 if TYPE_CHECKING:
@@ -106,7 +110,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--worlds",
         nargs="+",
-        default=["test"],
         help="names, world files, spans (rooms:100-109), splits (bars:test), barn, barn:PATH "
         "of its archive, or all (default: test)",
     )
@@ -149,20 +152,25 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--goal-radius", type=float, help="distance that reaches the goal [m] (default: likewise)"
     )
+    add_team(parser)
     add_plugin(parser)
     parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
     )
     parser.add_argument("--no-pictures", action="store_true", help="write only tables")
     options = parser.parse_args(arguments)
-    check_least(parser, options, episodes=1, seed=0)
+    check_least(parser, options, episodes=1, seed=0, team=1)
     if (options.path is None) == (options.policy is None):
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":
         parser.error(f"--memory {options.memory} is for --policy dwa alone: mpc has a map")
     try:
         options.robot = options.robot and resolve_robot(options.robot)
-        options.names = parse_worlds(options.worlds)
+        teams = options.team > 1
+        if options.right_of_way and not teams:
+            raise ValueError("--right-of-way must come with --team, got a team of 1")
+        options.worlds = options.worlds or (list(TEAM_WORLDS) if teams else ["test"])
+        options.names = team_worlds(options) if teams else parse_worlds(options.worlds)
         options.loaded = load_driver(options)
         if options.filter is None:
             options.filter = bool(options.approach) or needs_filter(options.loaded)
@@ -193,6 +201,8 @@ def conditions(options: argparse.Namespace) -> Conditions:
         options.approach,
         options.robot,
         {name: value for name, value in task.items() if value is not None},
+        options.team,
+        options.right_of_way,
     )
 
 
@@ -358,17 +368,28 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     from training.records import as_table, write_table
 
     policy = options.loaded
-    print(understood(policy.env_arguments.get("robot", "turtlebot2"), options.worlds))
+    asked: Conditions = options.asked
+    if asked.team == 1:
+        print(understood(policy.env_arguments.get("robot", "turtlebot2"), options.worlds))
     if options.path is not None and options.path.is_dir():
         for sentence in warnings_of(options.path):
             print(f"warning: {sentence}")
-    asked: Conditions = options.asked
     driver: Drivable = policy
     if asked.filtered:
         driver = filtered(policy, approach=asked.approach, **asked.arguments)
     folder = options.output or output_folder(options)
     if options.live:
         return show_live(driver, options)
+    settings = json.dumps(described(options), indent=2) + "\n"
+    if asked.team > 1:
+        with held(folder):
+            summary = drive_teams(
+                driver, asked, options.names, folder, pictures=not options.no_pictures
+            )
+            write_text_atomically(settings, folder / files.SETTINGS)
+        print(f"\n{name_of(options)}, physics: {asked.physics}\n{printed_teams(summary)}")
+        print(f"written: {folder}")
+        return summary
     with held(folder):
         driven = drive(
             driver,
@@ -395,8 +416,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        document = json.dumps(described(options), indent=2) + "\n"
-        write_text_atomically(document, folder / files.SETTINGS)
+        write_text_atomically(settings, folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {asked.physics}\n{printed(summary)}")
     print(f"written: {folder}")
     if isinstance(policy, Policy) and options.path.is_dir():

@@ -22,7 +22,8 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from tqdm import tqdm
 
 import torchrl_mpfa as mpfa
-from mpfa_envs import ROOMS_TASK, Mirror, VectorNavigationEnv, evaluate, make_navigation_env
+from mpfa_envs import ROOMS_TASK, Mirror, evaluate, make_navigation_env
+from mpfa_envs.driver import Errand, Senses
 
 # The paper's robot sees only the half before it, and cannot stop.
 _PAPERS = {"robot": "turtlebot2", "clearance": 0.05, "reward": None}
@@ -173,19 +174,14 @@ class Driving:
         self.actor = actor
         self.states = torch.zeros(64, WIDTH)
 
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+    def begin(self, robot: int, errand: Errand) -> None:
         """Forget the episode before."""
         self.states[robot] = 0.0
 
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+    def drive(self, senses: Senses) -> NDArray[np.float32]:
         """One action for each robot."""
-        seen, states = torch.from_numpy(observations), self.states[robots]
-        action, self.states[robots] = self.actor.act(seen, states)
+        seen, states = torch.from_numpy(senses.observations), self.states[senses.robots]
+        action, self.states[senses.robots] = self.actor.act(seen, states)
         found: NDArray[np.float32] = action.numpy()
         return found
 

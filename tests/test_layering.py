@@ -119,10 +119,12 @@ ROOMS = (
     {"paths", "robots"},
     {"generators", "sensing"},
     {"safety"},
+    {"driver"},
+    {"control"},
     {"walkers", "tasks", "scene", "deploy"},
     {"env"},
-    {"policies", "planners", "ros"},
-    {"evaluation"},
+    {"policies", "planners"},
+    {"ros", "evaluation"},
     {"render"},
 )
 """The rooms of the navigation task, from the ground up."""
@@ -168,10 +170,7 @@ MESSAGES = {
             {"benchmarks/speed/bullet_world.py", "envs/mpfa_envs/robots/simulation.py"},
         ),
         ({"wandb"}, {"examples/training/run/loggers.py"}),
-        (
-            {"optuna"},
-            {"examples/training/comparison/ranges.py", "examples/training/comparison/search.py"},
-        ),
+        ({"optuna"}, {"examples/tune.py"}),
         (
             {"rclpy", *MESSAGES},
             {

@@ -155,7 +155,7 @@ _KEPT = "`make paper` alone writes it from [the rows that are kept](paper):"
 _FILES = [
     ["`tests.csv.gz`", "a test of a last policy"],
     ["`curves.csv.gz`", "an evaluation during training"],
-    ["`episodes/RUN.csv.gz`", "a training episode"],
+    ["`episodes.csv.gz`", "a training episode"],
     ["`question`", "a folder: the same of the runs that test whether MPFA-PER fails less often"],
     ["`figure_3.csv.gz`", "a TD error or a reward of an episode of Fig. 3"],
     ["`times.csv`", "training time of a run that had the machine to itself [min]"],

@@ -1,9 +1,9 @@
 """Kept rows of the paper's runs: compressed files that outlive the folders of the runs.
 
 A folder of rows holds ``tests.csv.gz``, the tests of every run in the unseen world,
-``curves.csv.gz``, its evaluations during training, ``episodes/RUN.csv.gz``, its training episodes,
-and ``times.csv``, training times of runs that had the machine to themselves. Its folder
-``question`` holds those of the runs that decide whether MPFA-PER fails less often than PER.
+``curves.csv.gz``, its evaluations during training, ``episodes.csv.gz``, its training episodes, and
+``times.csv``, training times of runs that had the machine to themselves. Its folder ``question``
+holds those of the runs that decide whether MPFA-PER fails less often than PER.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import gzip
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -29,7 +31,7 @@ RUN = ["arm", "seed"]
 TESTS = [*RUN, "episode", "success", "collision", "spl", "time_s"]
 CURVES = [*RUN, "total_steps", "success"]
 TIMES = [*RUN, "minutes"]
-EPISODES = ["world", "steps", "total_steps", "reward", "success", "collision"]
+EPISODES = [*RUN, "world", "steps", "total_steps", "reward", "success", "collision"]
 _DIGITS = {"spl": 3, "time_s": 1, "reward": 4, "minutes": 2}
 
 
@@ -59,41 +61,51 @@ class Rows:
 
     def episodes(self, arm: str) -> dict[int, pd.DataFrame]:
         """Return the training episodes of each run of an arm, by its seed."""
-        return {
-            seed: read_table(_episodes_file(self.folder, f"{arm}-{seed}"))
-            for seed in self.seeds(arm)
-        }
+        return {seed: self._trained[arm, seed] for seed in self.seeds(arm)}
+
+    @cached_property
+    def _trained(self) -> dict[Any, pd.DataFrame]:
+        """Training episodes of each run, by its arm and seed."""
+        found = _read(self.folder / "episodes.csv.gz", EPISODES)
+        return {(arm, seed): run.reset_index(drop=True) for (arm, seed), run in found.groupby(RUN)}
 
 
 def read_rows(folder: Path) -> Rows:
     """Read the rows in a folder; a missing file has none."""
     named = {"tests.csv.gz": TESTS, "curves.csv.gz": CURVES, "times.csv": TIMES}
-    found = [read_table(folder / name) for name in named]
-    tables = [
-        table if len(table) else pd.DataFrame(columns=columns)
-        for table, columns in zip(found, named.values(), strict=True)
-    ]
-    return Rows(folder, *tables)
+    return Rows(folder, *(_read(folder / name, columns) for name, columns in named.items()))
+
+
+def _read(path: Path, columns: list[str]) -> pd.DataFrame:
+    """Read a table that has its columns also where there is no file."""
+    found = read_table(path)
+    return found if len(found) else pd.DataFrame(columns=columns)
 
 
 def keep(planned: Iterable[Comparison], folder: Path) -> list[str]:
     """Add the rows of finished runs to those in a folder; return the names of these runs."""
-    there = read_rows(folder)
-    new = [run for run in finished(planned) if run[1].name not in there.runs]
-    tests, curves = [there.tests], [there.curves]
+    kept = read_rows(folder).runs
+    new = [run for run in finished(planned) if run[1].name not in kept]
+    if not new:
+        return []
+    made: dict[str, list[pd.DataFrame]] = {"episodes": [], "curves": [], "tests": []}
+    columns = {"episodes": EPISODES, "curves": CURVES, "tests": TESTS}
     for comparison, job in new:
-        for tables, path, columns in (
-            (tests, job.results(comparison.evaluation) / files.EPISODES, TESTS),
-            (curves, job.path / files.EVALUATIONS, CURVES),
-        ):
-            tables.append(read_table(path).assign(arm=arm_of(job), seed=job.seed)[columns])
-        trained = read_table(job.path / files.EPISODES)
-        write_rows(trained[EPISODES], _episodes_file(folder, job.name))
-    if new:
-        # The tests say which runs there are: they are written last.
-        for name, tables in (("curves", curves), ("tests", tests)):
-            table = pd.concat([each for each in tables if len(each)])
-            write_rows(table.sort_values(RUN, kind="stable"), folder / f"{name}.csv.gz")
+        paths = (
+            job.path / files.EPISODES,
+            job.path / files.EVALUATIONS,
+            job.results(comparison.evaluation) / files.EPISODES,
+        )
+        for (name, tables), path in zip(made.items(), paths, strict=True):
+            tables.append(read_table(path).assign(arm=arm_of(job), seed=job.seed)[columns[name]])
+    # The tests say which runs there are: they are written last.
+    for name, tables in made.items():
+        path = folder / f"{name}.csv.gz"
+        there = _read(path, columns[name])
+        # A process that was killed here has left rows of runs whose tests are not there.
+        whole = (there["arm"] + "-" + there["seed"].astype(str)).isin(kept)
+        table = pd.concat([each for each in (there[whole], *tables) if len(each)])
+        write_rows(table.sort_values(RUN, kind="stable"), path)
     return [job.name for _, job in new]
 
 
@@ -110,11 +122,6 @@ def keep_time(job: Job, folder: Path) -> None:
 def arm_of(job: Job) -> str:
     """Return the name of a run without its seed."""
     return job.name.removesuffix(f"-{job.seed}")
-
-
-def _episodes_file(folder: Path, run: str) -> Path:
-    """Return the file of a run's training episodes."""
-    return folder / "episodes" / f"{run}.csv.gz"
 
 
 def write_rows(table: pd.DataFrame, path: Path) -> None:

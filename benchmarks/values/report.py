@@ -28,7 +28,7 @@ HEAD = """\
 - **How sure.** Five of the six planned differences survive the correction, and their p are final.
   All others are exploratory.
 - **Changed after the start.** The table ended with five seeds for each buffer instead of ten
-  ([why](../changes.md#what-more-runs-could-not-decide))."""
+  ([why](../study.md#what-more-runs-could-not-decide))."""
 _DPI = 160
 
 

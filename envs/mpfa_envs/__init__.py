@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mpfa_envs.generators.generate import generate_world as generate_world
     from mpfa_envs.generators.generate import register_generator as register_generator
     from mpfa_envs.planners import PLANNERS as PLANNERS
+    from mpfa_envs.planners import make_pilot as make_pilot
     from mpfa_envs.planners import make_planner as make_planner
     from mpfa_envs.policies.export import export_policy as export_policy
     from mpfa_envs.policies.policy import POLICIES as POLICIES
@@ -73,7 +74,7 @@ _NAMES = {
     "evaluation.results": "summarize",
     "evaluation.runs": "evaluate run_tasks",
     "generators.generate": "GENERATORS generate_world register_generator",
-    "planners": "PLANNERS make_planner",
+    "planners": "PLANNERS make_pilot make_planner",
     "policies.export": "export_policy",
     "policies.policy": "POLICIES Policy load_policy save_policy",
     "robots.discrete": "DiscreteWheels",

@@ -20,8 +20,9 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
 from mpfa_envs.planners import DynamicWindow, MapPlanner, PredictiveControl
 from mpfa_envs.robots.drives import SERVERS
 from mpfa_envs.robots.model import RobotModel
@@ -30,7 +31,7 @@ from mpfa_envs.safety.filter import CLEARANCE
 from training.files import short_name
 from training.worlds import worlds_label
 
-_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot")
+_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot", "team", "right_of_way")
 """Conditions that an evaluation has no entry of where they are as in the training."""
 Drivable = Policy | MapPlanner | DynamicWindow | PredictiveControl | Filtered
 """Drivers of a robot, with the ``env_arguments`` that they need."""
@@ -79,6 +80,10 @@ class Conditions:
     """Another robot than that of the training."""
     task: Mapping[str, Any] = field(default_factory=dict)
     """``plan`` and ``goal_radius``, where they are others than in the training."""
+    team: int = 1
+    """Robots in a world."""
+    right_of_way: bool = False
+    """True if robots wait for those of a lower number."""
 
     @property
     def folder(self) -> str:
@@ -95,6 +100,8 @@ class Conditions:
             f"-approach{self.approach:g}" if self.approach else "",
             f"-{self.robot.name}" if self.robot is not None else "",
             *(f"-{name}-{value}" for name, value in self.task.items()),
+            f"-team{self.team}" if self.team > 1 else "",
+            "-right-of-way" if self.right_of_way else "",
             f"-seed{self.seed}" if self.seed else "",
             *(f"-{name}{value:g}" for name, value in errors.items() if value),
         ]
@@ -119,6 +126,8 @@ class Conditions:
             "noise": self.noise and asdict(self.noise),
             "latency": self.latency,
             "robot": self.robot and asdict(self.robot),
+            "team": self.team if self.team > 1 else None,
+            "right_of_way": self.right_of_way or None,
         }
         document = {"words": list(self.words), **tasks, **self.task}
         return document | {name: value for name, value in others.items() if value is not None}

@@ -76,25 +76,3 @@ def plot_scores(
 def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:
     """Mean of the last ``window`` values, of fewer at the start."""
     return values.astype(float).rolling(window, min_periods=1).mean().to_numpy()
-
-
-def plot_search(
-    trials: pd.DataFrame, importances: Mapping[str, float], path: Path, *, objective: str
-) -> None:
-    """Plot the value of each trial, the best so far, and the importance of each setting."""
-    panels = 2 if importances else 1
-    figure, axes = new_figure(1, panels, panel=(6.0, 3.6))
-    history, ended = axes[0], trials[trials["state"] == "COMPLETE"]
-    pruned = trials[trials["state"] == "PRUNED"]
-    history.plot(pruned["number"], pruned["value"], "x", color="0.6", label="pruned")
-    history.plot(ended["number"], ended["value"], "o", color=look(0)["color"], label="ended")
-    best = ended["value"].cummax()
-    history.step(ended["number"], best, where="post", color=look(1)["color"], label="best so far")
-    history.set(xlabel="trial", ylabel=f"{objective} in validation")
-    history.xaxis.get_major_locator().set_params(integer=True)
-    history.legend(frameon=False)
-    if importances:
-        names = list(importances)[::-1]
-        axes[1].barh(names, [importances[name] for name in names], color=look(0)["color"])
-        axes[1].set(xlabel="importance (PED-ANOVA)")
-    finish(figure, axes, path)

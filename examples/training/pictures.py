@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mpfa_envs import Policy, World, WorldTask
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.render import (
     drive_episode,
     film_episode,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def made_up(folder: Path, successes: dict[str, list[float]]) -> Rows:
     """Write rows of runs whose shares of success are given, by arm; return them."""
     rng = np.random.default_rng(0)
-    tests = []
+    tests, trained = [], []
     for arm, shares in successes.items():
         for seed, share in enumerate(shares, start=100):
             reached = np.arange(200) < round(200 * share)
@@ -52,6 +51,8 @@ def made_up(folder: Path, successes: dict[str, list[float]]) -> Rows:
             )
             episodes = pd.DataFrame(
                 {
+                    "arm": arm,
+                    "seed": seed,
                     "world": list("AAABBBCCCDDD"),
                     "steps": 100,
                     "total_steps": np.arange(1, 13) * 2500,
@@ -60,9 +61,9 @@ def made_up(folder: Path, successes: dict[str, list[float]]) -> Rows:
                     "collision": 0,
                 }
             )
-            path = folder / "episodes" / f"{arm}-{seed}.csv.gz"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            episodes.to_csv(path, index=False)
+            trained.append(episodes)
+    folder.mkdir(parents=True, exist_ok=True)
+    pd.concat(trained).to_csv(folder / "episodes.csv.gz", index=False)
     pd.concat(tests).to_csv(folder / "tests.csv.gz", index=False)
     return read_rows(folder)
 
@@ -287,11 +288,14 @@ def test_rows_of_a_finished_run_are_kept_once_with_its_time(tmp_path: Path) -> N
     assert kept.tests["success"].mean() == 0.75
     assert kept.tests["spl"].unique().tolist() == [0.512]
     assert len(kept.curves)
-    before = (rows / "tests.csv.gz").read_bytes()
+    before = {path.name: path.read_bytes() for path in rows.iterdir()}
+    assert set(before) == {"tests.csv.gz", "curves.csv.gz", "episodes.csv.gz"}
     assert keep(planned, rows) == []
-    shutil.rmtree(rows)
+    # As after a kill: the tests, which are written last, say which runs are kept.
+    (rows / "tests.csv.gz").unlink()
     assert keep(planned, rows) == ["ddpg-per-100"]
-    assert (rows / "tests.csv.gz").read_bytes() == before
+    assert {path.name: path.read_bytes() for path in rows.iterdir()} == before
+    assert [len(run) for run in read_rows(rows).episodes("ddpg-per").values()] == [4]
     keep_time(job, rows)
     keep_time(job, rows)
     assert read_rows(rows).times["minutes"].between(0.0, 5.0).tolist() == [True]

@@ -23,8 +23,8 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, sct, spl, wilson
-from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.policies.layers import Linear, Tanh
 from mpfa_envs.policies.policy import policy_file
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot

@@ -15,14 +15,13 @@ from mpfa_envs import (
     WORLDS,
     Box,
     NavigationEnv,
-    VectorNavigationEnv,
     World,
     evaluate,
     make_planner,
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.evaluation.runs import as_driver
+from mpfa_envs.driver import Errand, Senses, as_driver
 from mpfa_envs.generators.generate import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners import (
@@ -249,22 +248,25 @@ def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.Monkey
     assert [(result.plan_s, result.decision_s) for result in results] == [(1.0, 0.25)] * 4
 
 
-def test_a_driver_sees_each_episodes_world_and_task() -> None:
-    begun: list[tuple[str, tuple[float, float]]] = []
+def test_a_driver_is_told_each_errand_and_what_its_robots_sense() -> None:
+    begun: list[tuple[str, tuple[float, float, float], tuple[float, float]]] = []
+    goals: dict[int, tuple[float, float]] = {}
 
     class Told:
-        def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-            task = env.tasks[robot]
-            assert task is not None
-            assert env.poses[robot] == pytest.approx(task.start)
-            begun.append((env.worlds[robot].name, task.goal))
+        def begin(self, robot: int, errand: Errand) -> None:
+            assert errand.world is not None and errand.map_shape is not None
+            begun.append((errand.world.name, errand.start, errand.goal))
+            goals[robot] = errand.goal
 
-        def drive(
-            self, env: VectorNavigationEnv, robots: np.ndarray, observations: np.ndarray
-        ) -> np.ndarray:
-            assert len(robots) == len(observations)
-            return np.ones((len(robots), 2), np.float32)
+        def drive(self, senses: Senses) -> np.ndarray:
+            count = len(senses.robots)
+            size = senses.observations.shape[1]
+            assert senses.states.shape == (count, 1, size) and senses.motions.shape == (count, 5)
+            assert senses.goals.tolist() == [list(goals[robot]) for robot in senses.robots]
+            assert senses.maps is not None and senses.maps.shapes.shape == (2, 2)
+            np.testing.assert_array_equal(senses.poses, senses.motions[:, :3])
+            return np.ones((count, 2), np.float32)
 
     tasks = world_tasks("A", episodes=3) + world_tasks("B", episodes=2)
-    run_tasks(Told(), tasks, envs_at_once=2, physics="kinematic", max_steps=10)
-    assert sorted(begun) == sorted((each.world.name, each.task.goal) for each in tasks)
+    run_tasks(Told(), tasks, envs_at_once=2, physics="kinematic", memory="map", max_steps=10)
+    assert sorted(begun) == sorted((each.world.name, *each.task) for each in tasks)

@@ -19,10 +19,7 @@ from mpfa_envs import (
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.evaluation.runs import Driver
-from mpfa_envs.paths.grid_loops import MOVES, path_lengths
-from mpfa_envs.planners import PredictiveControl
-from mpfa_envs.planners.predictive_loops import (
+from mpfa_envs.control.predictive_loops import (
     CELL,
     ROOMY,
     Effort,
@@ -31,6 +28,9 @@ from mpfa_envs.planners.predictive_loops import (
     rollout,
     room_around,
 )
+from mpfa_envs.driver import Driver
+from mpfa_envs.paths.grid_loops import MOVES, path_lengths
+from mpfa_envs.planners import PredictiveControl
 from mpfa_envs.robots.model import ROBOTS, RobotModel
 from mpfa_envs.tasks.sampling import WorldTask
 
@@ -58,7 +58,16 @@ def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> P
     speeds, counts = np.array([[speed, speed]]), np.zeros(1, np.int64)
     levels, pose = np.zeros((200, 200), np.uint8), (9.0, 10.0, 0.0)
     return PlanningState(
-        pose, speeds, points, counts, -1.0, rooms[None], levels, lengths, (9.0 + goal, 10.0, 0.47)
+        pose,
+        speeds,
+        points,
+        counts,
+        BODY,
+        -1.0,
+        rooms[None],
+        levels,
+        lengths,
+        (9.0 + goal, 10.0, 0.47),
     )
 
 
@@ -223,19 +232,19 @@ def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
     with_map = {"robot": "kobuki", "physics": "kinematic", "memory": "map", "contact": True}
     env = VectorNavigationEnv(1, world=DOOR, **with_map)
     options = {"tasks": [Task((-2.0, 0.0, 0.0), (2.0, 0.0))]}
-    seen, _ = env.reset(seed=0, options=options)
-    planner.begin(env, 0)
+    env.reset(seed=0, options=options)
     robots = np.zeros(1, np.int64)
-    first = planner.drive(env, robots, seen)
+    planner.begin(0, env.errand(0))
+    first = planner.drive(env.senses(robots))
     lengths = planner._episodes[0].lengths[30:36, 54]
     assert (np.diff(lengths) < 0.0).all()
     for _ in range(15):  # It is held: nothing is driven.
-        planner.drive(env, robots, seen)
+        planner.drive(env.senses(robots))
     raised = planner._episodes[0].raised
     assert raised.max() == 25 and 6 <= np.count_nonzero(raised) <= 9
-    again, _ = env.reset(seed=0, options=options)
-    planner.begin(env, 0)
-    np.testing.assert_array_equal(planner.drive(env, robots, again), first)
+    env.reset(seed=0, options=options)
+    planner.begin(0, env.errand(0))
+    np.testing.assert_array_equal(planner.drive(env.senses(robots)), first)
 
 
 def test_predictive_control_needs_the_map_of_its_robot() -> None:
@@ -258,26 +267,26 @@ def test_a_robot_plans_from_where_its_odometry_places_it_and_behind_the_filter()
     planner = PredictiveControl(robot="kobuki")
     task: dict[str, Any] = {"robot": "kobuki", "physics": "kinematic", "memory": "map"}
     env = VectorNavigationEnv(1, world="D", noise={"drift": 0.3}, goal_radius=0.3, **task)
-    seen, _ = env.reset(seed=0)
-    planner.begin(env, 0)
+    env.reset(seed=0)
+    planner.begin(0, env.errand(0))
     robots = np.zeros(1, np.int64)
     for _ in range(12):
-        seen, *_ = env.step(planner.drive(env, robots, seen))
-    scene = planner._scene(env, 0, seen[0])
-    assert env.maps is not None
+        env.step(planner.drive(env.senses(robots)))
+    kept = planner._keep
+    assert kept is not None and env.maps is not None
+    scene = planner._scene(kept, env.maps, env.senses(robots), 0)
     place = np.array(scene.pose[:2]) + env.maps.origins[0]
     assert math.dist(place, env.measurements[0, 4:6]) < 1e-9 < math.dist(place, env.poses[0, :2])
     assert scene.goal[2] == pytest.approx(0.94 * 0.3)
-    kept = planner._keep
     calls: list[int] = []
+    among = kept.among
 
     def count(*arguments: Any) -> Any:
         calls.append(1)
-        return kept(*arguments)
+        return among(*arguments)
 
-    count.seen = kept.seen  # type: ignore[attr-defined]
-    planner._keep = count  # type: ignore[assignment]
-    planner.drive(env, robots, seen)
+    kept.among = count  # type: ignore[method-assign]
+    planner.drive(env.senses(robots))
     assert calls
     env.close()
 

@@ -18,7 +18,7 @@ from mpfa_envs import (
     World,
     evaluate,
 )
-from mpfa_envs.evaluation.runs import Filtered
+from mpfa_envs.driver import Filtered
 from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.sensing.lidar import ray_angles
 

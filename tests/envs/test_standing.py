@@ -33,8 +33,8 @@ def sector(degrees: float) -> int:
 
 def test_walls_of_the_plan_stand_and_an_opening_and_its_edges_do_not() -> None:
     found = known(PLAN)
-    assert found[[sector(angle) for angle in (95.0, 115.0, 60.0, -85.0, -45.0, -135.0)]].all()
-    opening = [sector(angle) for angle in (50.0, 35.0, 25.0)]
+    assert found[[sector(angle) for angle in (95.0, 115.0, 65.0, -85.0, -45.0, -135.0)]].all()
+    opening = [sector(angle) for angle in (55.0, 45.0, 35.0, 25.0)]
     assert not found[opening].any()
     # Behind the ends of the corridor there is nothing that the plan knows nearby.
     assert not found[[sector(1.0), sector(179.0)]].any()
@@ -62,7 +62,7 @@ def test_a_sector_seen_from_elsewhere_stands_if_all_its_hits_do() -> None:
     place = np.array([0.5, 0.0, 0.0])
     found = standing_sectors(standing, HERE, angles, ranges, FAR, place, math.tau, 36)
     # A meter ahead is half a meter ahead then, where angles are twice as large.
-    assert np.flatnonzero(found).tolist() == [sector(math.degrees(0.2))]
+    assert np.flatnonzero(found).tolist() == [sector(math.degrees(0.2)), sector(0.0)]
 
 
 def test_a_pilot_that_knows_its_corridor_drives_faster_than_one_that_does_not() -> None:

@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from training.figures import plot_evaluations, plot_learning_curve, plot_search
+from training.figures import plot_evaluations, plot_learning_curve
 
 BLUE, ORANGE, GRAY = (0, 114, 178), (230, 159, 0), (128, 128, 128)
 
@@ -67,26 +67,3 @@ def test_evaluations_are_at_their_steps_and_rates(tmp_path: Path) -> None:
     rising, falling = (colored(path, color, spread=30) for color in (BLUE, ORANGE))
     assert heights(rising, quarter=0) < 0.4 < 0.6 < heights(rising, quarter=3)
     assert heights(falling, quarter=3) < 0.4 < 0.6 < heights(falling, quarter=0)
-
-
-def test_the_picture_of_a_search_has_its_trials_the_best_so_far_and_what_mattered(
-    tmp_path: Path,
-) -> None:
-    states = ["COMPLETE", "PRUNED", "COMPLETE", "COMPLETE"]
-    trials = pd.DataFrame(
-        {"number": range(4), "value": [0.2, 0.05, 0.8, 0.4], "state": states}, dtype=object
-    )
-    path = tmp_path / "search.png"
-    plot_search(trials, {"tau": 0.9, "gamma": 0.1}, path, objective="area")
-    bars = colored(path, BLUE)
-    half = bars.shape[1] // 2
-    # The best so far rises and stays where it is.
-    best = colored(path, ORANGE)[:, :half]
-    assert heights(best, quarter=1) < 0.5 < heights(best, quarter=3)
-    # The first importance is on top, and its bar the longer one.
-    rows = bars[:, half:].sum(1)
-    upper, lower = rows[: len(rows) // 2].max(), rows[len(rows) // 2 :].max()
-    assert upper > 6 * lower > 0
-    plot_search(trials, {}, tmp_path / "few.png", objective="area")
-    with Image.open(tmp_path / "few.png") as few, Image.open(path) as both:
-        assert 2 * few.width == both.width

@@ -100,12 +100,14 @@ def test_every_robot_of_an_evaluation_remembers_its_own_episode() -> None:
     actor = page.Actor(SIZE, forgetful=False)
     driving = page.Driving(actor)
     env = VectorNavigationEnv(3, physics="kinematic")
-    seen = np.random.default_rng(0).random((3, SIZE)).astype(np.float32)
+    env.reset(seed=0)
     for robot in range(3):
-        driving.begin(env, robot)
-    first = driving.drive(env, np.arange(3), seen)
-    driving.begin(env, 1)
-    again = driving.drive(env, np.array([1, 2]), seen[1:])
+        driving.begin(robot, env.errand(robot))
+    senses = env.senses(np.arange(3))
+    first = driving.drive(senses)
+    driving.begin(1, env.errand(1))
+    last = senses._replace(robots=senses.robots[1:], observations=senses.observations[1:])
+    again = driving.drive(last)
     # Products of two rows and of three round differently on some processors.
     np.testing.assert_allclose(again[0], first[1], rtol=0, atol=1e-7)
     assert abs(again[1] - first[2]).max() > 1e-5

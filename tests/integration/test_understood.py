@@ -6,13 +6,11 @@ import json
 import warnings
 from pathlib import Path
 
-import optuna
 import pytest
 
 from mpfa_envs import EXAMPLE_ROBOT, Box, World, save_world
 from tests.integration.run.test_runs import begin
 from training import extra, files
-from training.comparison.search import best_of, equals_of
 from training.finished import warnings_of
 from training.worlds import narrowest_door, understood
 
@@ -79,20 +77,6 @@ def test_a_run_that_is_not_finished_is_told(
 
 def test_a_folder_without_a_status_is_told_nothing_of(tmp_path: Path) -> None:
     assert warnings_of(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("values", "best", "others"),
-    [([0.0, 0.0, 0.0], 0, [1, 2]), ([0.1, 0.5, 0.5], 1, [2]), ([0.1, 0.5, 0.4], 1, [])],
-)
-def test_trials_with_the_value_of_the_best_are_named(
-    values: list[float], best: int, others: list[int]
-) -> None:
-    study = optuna.create_study(direction="maximize")
-    for value in values:
-        study.add_trial(optuna.trial.create_trial(value=value))
-    found = best_of(study)
-    assert found is not None and (found.number, equals_of(found, study)) == (best, others)
 
 
 def test_a_warning_of_the_project_is_shown_once_in_one_line(

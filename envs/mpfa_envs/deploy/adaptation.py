@@ -138,7 +138,7 @@ def filter_of(
             f"nothing, got {clearance}"
         )
     check_view(robot, robot.field_of_view)
-    repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
+    repeat = card.action_repeat * _PARTS
     rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
     return SafetyFilter(
         body,

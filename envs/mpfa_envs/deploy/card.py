@@ -102,6 +102,11 @@ class Card:
     """Facts about its training."""
 
     @property
+    def action_repeat(self) -> int:
+        """Time steps of a decision, as it learned."""
+        return int(self.env_arguments.get("action_repeat", 2))
+
+    @property
     def needs_filter(self) -> bool:
         """True if it learned behind a filter, and never what a collision costs."""
         return bool(self.training.get("filter", False))

@@ -37,6 +37,11 @@ class Ground:
         self._center: tuple[float, float] | None = None
         self._begins = False
 
+    @property
+    def begins(self) -> bool:
+        """True if the next observation is the first of a goal or of a map."""
+        return self.is_new or self._begins
+
     def begin(
         self,
         goal: tuple[float, float],
@@ -72,7 +77,7 @@ class Ground:
 
     def closes_in(self, radius: float, place: tuple[float, float]) -> bool:
         """Return True if walls that are known keep a place from within a radius of the goal."""
-        if self.map is None or self.goal is None or self.is_new or self._begins:
+        if self.map is None or self.goal is None or self.begins:
             return False
         return self.map.closes_in(self.goal, radius, place)
 
@@ -111,9 +116,15 @@ class Ground:
         """Enter points taken at a pose; the path from another, ``[0, 3]`` or as that of the map."""
         if self.map is None or self.goal is None:
             return np.zeros((0, 3))
-        if self.is_new or self._begins:
+        if self.begins:
             self._center, self._begins = self._center or place, False
             self.map.begin(self._center, sides_of(self.plan, self._map_size), self.plan)
             if self.is_new and self.plan is not None:
                 self.map.reject_closed(self.goal, radius, place)
         return self.map.sense(pose, taken, self.goal, points)
+
+    def known(self) -> tuple[World | None, tuple[float, float, float]]:
+        """The world of the plan, and the pose of its frame; None without a plan."""
+        if self.plan is None:
+            return None, (0.0, 0.0, 0.0)
+        return self.plan.world, (*self.plan.middle, self.plan.pose[2])

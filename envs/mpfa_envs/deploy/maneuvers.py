@@ -5,35 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from mpfa_envs.checks import check_number, check_positive
+from mpfa_envs.control.standing import STANDING_TIME, stands_still
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
     from mpfa_envs.deploy.card import Card
     from mpfa_envs.robots.model import RobotModel
-
-STANDING_TIME: Final = 10.0
-"""A robot stands still that has not left a small square for this long [s]."""
-STANDING_SIDE: Final = 0.1
-"""Side of the square [m]."""
-
-
-def stands_still(places: Sequence[Sequence[float]] | NDArray[np.float64], period: float) -> bool:
-    """Return True if a robot has come nowhere of late, whether or not it turns.
-
-    Args:
-        places: Positions (x, y) so far, ``[T, 2]`` [m].
-        period: Time from one to the next [s].
-    """
-    count = math.ceil(STANDING_TIME / period) + 1
-    last = places[-count:]
-    return len(last) == count and bool((np.ptp(last, axis=0) <= STANDING_SIDE).all())
-
 
 _BACK: Final = 0.5
 """Distance by which a robot that stands still drives back [m]."""
@@ -64,11 +41,15 @@ class WayBack:
         return stands_still(self._places, self._period)
 
     def speeds(
-        self, pose: tuple[float, float, float], time: float, *, reverses: bool
+        self, pose: tuple[float, float, float], time: float, *, reverses: bool, led: bool
     ) -> tuple[float, float] | None:
-        """Speeds of the wheels on the way back [m/s]; None: the policy decides."""
+        """Speeds of the wheels on the way back [m/s]; None: the policy decides, or who leads it."""
         robot, (x, y, heading) = self._robot, pose
         self._places.append((x, y))
+        if led:
+            # It begins to count when it is led no more.
+            self._target, self._since = None, time
+            return None
         waits = time - self._since >= STANDING_TIME
         # Wheels that only turn forward cannot turn it on the spot, either.
         if self._target is None and waits and robot.min_wheel_speed < 0.0 and self.stands_still:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
+    from mpfa_envs.sensing.map_loops import MapArrays
 
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
@@ -150,6 +151,18 @@ class MapPath:
             self._hits.begin(center, size, plan.world, (*plan.middle, plan.pose[2]))
             x, y = np.subtract(plan.middle, center).tolist()
             self._memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
+
+    @property
+    def arrays(self) -> MapArrays:
+        """The map, which changes with each scan, in the frame of the odometry."""
+        arrays = self._memory.arrays
+        return arrays._replace(origins=arrays.origins + self._center)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Its columns and rows."""
+        columns, rows = self._memory.arrays.shapes[0].tolist()
+        return columns, rows
 
     def look_again(self) -> None:
         """The goal has moved: no path to it is known."""

@@ -1,4 +1,4 @@
-"""From scan, odometry and goal to wheel speeds: one decision of an exported policy."""
+"""From scan, odometry and goal to wheel speeds: one decision of a policy, or of a planner."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_not_negative, check_number
+from mpfa_envs.checks import check_bool, check_not_negative, check_number
 from mpfa_envs.deploy.adaptation import (
     body_of,
     cannot_turn,
@@ -18,22 +18,23 @@ from mpfa_envs.deploy.adaptation import (
     reject_blind_front,
     tolerance,
 )
+from mpfa_envs.deploy.asked import Asked, rescued
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import pair_of
 from mpfa_envs.robots.drives import OFF, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
+from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.scan import Scan
 from mpfa_envs.sensing.sectors import Sectors, Silent, observations_from
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.safety.filter import SafetyFilter
+    from mpfa_envs.driver import Action, Driver
     from mpfa_envs.worlds.world import World
 
 _TOWARDS: Final = math.radians(45.0)
@@ -54,7 +55,7 @@ class Command(NamedTuple):
 
 
 class Pilot:
-    """Runs a policy on a robot: NumPy and onnxruntime, and Numba if the policy has a map.
+    """Runs a policy or a planner on a robot: NumPy and onnxruntime, and Numba if it has a map.
 
     A slower robot than that of the training drives the same arcs at a slower pace p: its decisions
     come later and its speeds are read as if it were the other one. Speeds are p times as large and
@@ -65,7 +66,9 @@ class Pilot:
 
     Args:
         card: Of the policy.
-        network: From observations ``[1, O]`` to actions ``[1, 2]``.
+        driver: From observations ``[1, O]`` to actions ``[1, 2]``, or a
+            :class:`~mpfa_envs.driver.Driver`, which drives robot 0.
+            :func:`~mpfa_envs.planners.make_pilot` makes a pilot of a planner.
         robot: What drives, as any environment takes it; None: the robot that the policy learned
             with.
         pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can, so
@@ -78,9 +81,8 @@ class Pilot:
             position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
-        approach: Speed of what may come [m/s]: the filter has the robot stand before such a thing,
-            seen or hidden by what is seen, could touch it. Walls are such things, too, but those of
-            a plan.
+        approach: Speed of what may come, before which the filter has it stand [m/s]: all that is
+            seen and what that hides, walls too, but those of a plan.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot drives the orders under way first, and
             decides for the state that it comes to; its filter allows for an error of 0.05 s, and
@@ -88,6 +90,8 @@ class Pilot:
         goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
             Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
             where it arrives.
+        rescue: If True, and there are a map and a filter, predictive control leads the robot away
+            where it stands still again (:class:`~mpfa_envs.control.rescue.Rescued`).
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -98,7 +102,7 @@ class Pilot:
     def __init__(
         self,
         card: Card,
-        network: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        driver: Action | Driver,
         *,
         robot: RobotChoice | None = None,
         pace: float | None = None,
@@ -110,6 +114,7 @@ class Pilot:
         approach: float = 0.0,
         latency: float | None = None,
         goal_radius: float | None = None,
+        rescue: bool = True,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -120,7 +125,6 @@ class Pilot:
         self.sectors = Sectors(
             card, mount=mount, unseen=unseen, silent=silent, radius=self.robot.radius
         )
-        self._network = network
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
@@ -129,6 +133,10 @@ class Pilot:
         self._approach = check_not_negative("approach", approach)
         self._keep = self._filter(clearance)
         self._still: NDArray[np.bool_] | None = None
+        if check_bool("rescue", rescue) and card.memory == "map" and self._keep is not None:
+            driver = rescued(driver)
+        self._asked = Asked(driver, card, self._ground, self._make_filter)
+        self._planned: SafetyFilter | None = None
         self._way_back = WayBack(card.robot, self.period)
         self._orders, self._time = Orders(self.robot), 0.0
         self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
@@ -172,13 +180,18 @@ class Pilot:
     def _filter(self, clearance: float | None) -> SafetyFilter | None:
         """Make the filter that keeps a clearance [m]; None: no filter."""
         # At a slower pace things come faster, in the policy's time.
-        approach = self._approach / self.pace
-        return filter_of(self.card, self.robot, self._body, clearance, approach)
+        facts = self.card, self.robot, self._body
+        return filter_of(*facts, clearance, self._approach / self.pace)
 
     @property
     def recoveries(self) -> int:
         """How often the robot has driven back since it set out."""
         return self._way_back.count
+
+    @property
+    def is_led(self) -> bool:
+        """True while predictive control leads a robot away that stood still again."""
+        return self._asked.is_led
 
     @property
     def has_filter(self) -> bool:
@@ -308,7 +321,7 @@ class Pilot:
             ScanError: If the scan lacks the range of a sector.
             ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
-        return self._observe(scan, pose, speeds, scan_pose, time, age)[0]
+        return self._observe(scan, pose, speeds, scan_pose, time, age)[0][0]
 
     def _observe(
         self,
@@ -318,8 +331,8 @@ class Pilot:
         scan_pose: tuple[float, float, float] | None,
         time: float | None,
         age: float,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """The observation; those that the filter allows for, ``[S, O]``; and the turn till then."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
+        """Observations that the filter allows for, ``[S, O]``; their states; the turn till then."""
         if self.goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
@@ -333,6 +346,8 @@ class Pilot:
         # Unless there is another order, as after an error: who gets none stops.
         self.give(self._time, 0.0, 0.0)
         self._ground.check_at((x, y))
+        if self._ground.begins:
+            self._asked.begin()
         ranges, points = self.sectors.read(scan)
         path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
         self._still = self._ground.standing(ahead, taken, points) if self._approach else None
@@ -340,7 +355,7 @@ class Pilot:
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
         self._ground.is_new = False
-        return rows[0], rows, float(ahead[0, 2] - taken[2])
+        return rows, ahead, float(ahead[0, 2] - taken[2])
 
     def give(self, time: float, linear: float, angular: float) -> None:
         """Remember what was ordered, where that is not what the pilot has decided.
@@ -366,7 +381,7 @@ class Pilot:
         """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
 
         Args:
-            scan: What the lidar has measured.
+            scan: As there.
             pose: As there.
             speeds: As there.
             scan_pose: As there.
@@ -383,15 +398,17 @@ class Pilot:
         if not self.arrived(pose) and self._arrival.turns:
             self._time = self._time + self.period if time is None else check_number("time", time)
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
-        observation, states, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
+        rows, ahead, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        slower = math.inf if self.goal is None else self._arrival.fastest(pose, self.goal)
-        action = self._network(observation[None])[0]
-        if not np.isfinite(action).all():
-            raise ValueError(f"the network's action must be finite, got {action}")
+        goal = self._ground.goal or pose[:2]
+        slower = self._arrival.fastest(pose, goal)
+        # Whatever the policy reads in them, sectors that are not seen begin at the rim.
+        states = rows.copy()
+        states[:, : self.card.sectors][:, hidden] = 1.0
+        action = self._asked.act(rows, states, ahead, goal, self.goal_radius)
         learned = self.card.robot
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
-        back = self._way_back.speeds(pose, self._time, reverses=reverses)
+        back = self._way_back.speeds(pose, self._time, reverses=reverses, led=self._asked.is_led)
         left, right = back or learned.wheel_speeds(action)
         share = min(1.0, slower / max(abs(left + right) / 2.0, 1e-9))
         left, right = share * left, share * right
@@ -405,8 +422,6 @@ class Pilot:
             left = -right
         if self._keep is not None:
             reject_blind_front(blind)
-            # Whatever the policy reads in them, sectors that are not seen begin at the rim.
-            states[:, : self.card.sectors][:, hidden] = 1.0
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
             if (still := self._still) is not None:
@@ -415,6 +430,12 @@ class Pilot:
             left, right = nearest_admissible(self._keep, learned, states, wheels, old, still)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
+
+    def _make_filter(self) -> SafetyFilter:
+        """The filter of this pilot, or the one that it would have."""
+        made = self._planned = self._keep or self._planned or self._filter(CLEARANCE)
+        assert made is not None
+        return made
 
     def _command(self, linear: float, angular: float) -> Command:
         """The command for speeds of the body [m/s, rad/s]."""

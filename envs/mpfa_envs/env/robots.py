@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,11 +20,19 @@ from mpfa_envs.env.step_loops import (
     measure_remaining,
     settle,
 )
+from mpfa_envs.env.team import Team
 from mpfa_envs.paths.distance import FieldArrays
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation import FLAGS, NUMBERS, lidar_pose, look_from, observe_all
+from mpfa_envs.sensing.observation import (
+    FLAGS,
+    INFO_TYPES,
+    NUMBERS,
+    lidar_pose,
+    look_from,
+    observe_all,
+)
 from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
@@ -45,22 +53,27 @@ if TYPE_CHECKING:
 _TRAIL = 500
 """Time steps that trails have room for at first."""
 _NO_PATHS = np.zeros((0, 3))
+_MASKS = tuple(f"_{name}" for name in INFO_TYPES)
+_INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 
 
 class RobotBatch:
     """The state of many robots, and its changes."""
 
-    def __init__(self, config: TaskConfig, lidar: Lidar, worlds: Sequence[World]) -> None:
+    def __init__(
+        self, config: TaskConfig, lidar: Lidar, worlds: Sequence[World], team: int = 1
+    ) -> None:
         count = len(worlds)
         self._config = config
         self._lidar = lidar
         self.tasks: list[Task | None] = [None] * count
         """Start and goal of each robot's episode; None before the first."""
-        self.worlds = WorldBatch(worlds)
+        radius = config.robot.radius
+        self.worlds = WorldBatch(worlds, mates=team - 1, radius=radius)
         """The present world of each robot."""
-        self.walkers = WalkerBatch(
-            self.worlds, radius=config.robot.radius, time_step=config.time_step
-        )
+        self.team = Team(self.worlds, team, radius) if team > 1 else None
+        """The other robots in these, if there are any."""
+        self.walkers = WalkerBatch(self.worlds, radius=radius, time_step=config.time_step)
         """The walkers around each robot."""
         self._fields = FieldArrays.empty(count) if config.progress == "shortest_path" else None
         self.episodes = EpisodeArrays(
@@ -175,6 +188,8 @@ class RobotBatch:
             self.walkers.move(running, episodes.motions)
             due = speeds if self._orders is None else self._orders.arriving(speeds, running)
             self.drives.move(episodes.motions, running, due, disturb)
+            if self.team is not None:
+                self.team.place(episodes.motions)
             if noise is not None:
                 noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
@@ -297,6 +312,10 @@ class RobotBatch:
             rows.append(standing_sectors(hits, *scan, far, place, view, lidar.sectors))
         return np.array(rows).reshape(len(rows), lidar.sectors)
 
+    def measured(self) -> NDArray[np.float64]:
+        """Motions by odometry when the next orders act, ``[N, 5]``."""
+        return self._motions()[1]
+
     def _motions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """By odometry, motions now and when the next orders act, ``[N, 5]``."""
         here = self.episodes.motions if self.noise is None else self.noise.odometry
@@ -331,10 +350,33 @@ class RobotBatch:
             )
         return seen
 
+    def infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
+        """The infos of the chosen robots, or of all: an array for each key, and its mask."""
+        # Rows of one table, as copies one by one would take longer than all the rest.
+        masks = np.empty((len(_MASKS), len(self.tasks)), dtype=np.bool_)
+        masks[:] = True if chosen is None else chosen
+        rows = *self.episodes.flags.copy(), *self.episodes.numbers.copy(), *masks
+        return dict(zip(_INFO_KEYS, rows, strict=True))
+
+    def final_infos(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
+        """The last observations and infos of the robots whose episodes have ended, ``[N]``."""
+        seen = np.full(len(ended), None, dtype=object)
+        for index in np.flatnonzero(ended).tolist():
+            seen[index] = self.observations[index].copy()
+        infos = self.infos(ended)
+        return {"final_obs": seen, "_final_obs": ended, "final_info": infos, "_final_info": ended}
+
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m]."""
         rows = self.trails[index, : self.episodes.steps[index] + 1, :2]
         return [(x, y) for x, y in rows.tolist()]
+
+    def moving(self, index: int) -> NDArray[np.float64]:
+        """What moves around a robot: (x, y), speeds in both directions, radius, ``[K, 5]``."""
+        walkers = self.walkers.of(index)
+        if self.team is None:
+            return walkers
+        return np.concatenate((walkers, self.team.of(index, self.episodes.motions)))
 
     def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
         """Functions that render each robot's world as it is now from above, ``[H, W, 3]``."""
@@ -352,7 +394,7 @@ class RobotBatch:
                 trail=self.trail(index),
                 rays=self._lidar.around_center(self.ranges[index].copy()),
                 known_map=None if self.memory is None else self.memory.known_map(index, x, y),
-                walkers=self.walkers.of(index),
+                walkers=self.moving(index),
             )
             for index, (x, y, heading) in enumerate(self.episodes.motions[:, :3].tolist())
         )

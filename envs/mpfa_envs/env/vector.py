@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.driver import Errand, Senses
 from mpfa_envs.env.config import TaskConfig, check_names
 from mpfa_envs.env.episodes import EpisodeSource, WorldChoice, read_state, robot_to_plain
 from mpfa_envs.env.reset_options import (
@@ -26,21 +28,20 @@ from mpfa_envs.env.reset_options import (
 )
 from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.env.step_loops import outcomes
-from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
+from mpfa_envs.env.team import check_starts, check_team
 from mpfa_envs.worlds.world import Task, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.safety.filter import SafetyFilter
     from mpfa_envs.sensing.map_loops import MapArrays
 
 _EMPTY = World(name="empty")
-_MASKS = tuple(f"_{name}" for name in INFO_TYPES)
-_INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 
 
 class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]):
-    """Many robots drive to goals by lidar, each in its own world and without the others.
+    """Many robots drive to goals by lidar, each in its own world, or several in one.
 
     It is :class:`~mpfa_envs.NavigationEnv` N times, with the same observations, actions, rewards,
     ends and infos, and a robot drives the same trajectory in it; but compiled loops move, sense and
@@ -67,6 +68,9 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
             to ``infos["final_obs"]`` and ``infos["final_info"]``; ``DISABLED`` when
             ``reset(options={"reset_mask": ...})`` asks for it.
         render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+        team: Robots in a world: the first so many, the next, and so on. Each is a moving obstacle
+            of the others, and stays where its episode ended. Such an environment takes
+            ``autoreset_mode=DISABLED`` and the tasks of all robots (:mod:`mpfa_envs.tasks.teams`).
         **task: Fields of :class:`~mpfa_envs.TaskConfig`. On wheels there are no bodies of the
             obstacles, as the shapes say what collides.
 
@@ -103,6 +107,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         split: Literal["train", "validation"] = "train",
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: Literal["rgb_array"] | None = None,
+        team: int = 1,
         **task: Any,
     ) -> None:
         self.num_envs = check_count("num_envs", num_envs)
@@ -116,6 +121,8 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
                 f"autoreset_mode must be a gymnasium.vector.AutoresetMode, got {autoreset_mode!r}"
             )
         self.autoreset_mode = autoreset_mode
+        self.team = check_team(team, self.num_envs, autoreset_mode)
+        """Number of robots in a world."""
         self.lidar = self.config.make_lidar()
         """The robots' lidar, in an empty world."""
         self._source = EpisodeSource(
@@ -138,11 +145,12 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         self._seeded: dict[int, np.random.Generator] = {}
         """Sources of randomness of the episodes that begin next, where seeds were given."""
         self._begun = False
+        self._filter: SafetyFilter | None = None
 
     def _make_batch(self) -> RobotBatch:
         """Make robots whose episodes have not begun."""
         worlds = [self._source.fixed(index) or _EMPTY for index in range(self.num_envs)]
-        return RobotBatch(self.config, self.lidar, worlds)
+        return RobotBatch(self.config, self.lidar, worlds, self.team)
 
     @property
     def worlds(self) -> list[World]:
@@ -190,6 +198,64 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         memory = self._batch.memory
         return None if memory is None else memory.arrays
 
+    def errand(self, index: int) -> Errand:
+        """What a robot has to do in the present episode, as a driver is told it.
+
+        Args:
+            index: Number of the robot.
+
+        Returns:
+            The errand; it knows the world.
+
+        Raises:
+            ResetNeeded: If no episode has started.
+        """
+        task, maps, config = self._batch.tasks[index], self.maps, self.config
+        if task is None:
+            raise ResetNeeded("there is no errand: call reset() first")
+        shape = None
+        if maps is not None:
+            columns, rows = maps.shapes[index].tolist()
+            shape = columns, rows
+        return Errand(
+            start=task.start,
+            goal=task.goal,
+            goal_radius=config.goal_radius,
+            time_step=config.time_step,
+            action_repeat=config.action_repeat,
+            make_filter=self._make_filter,
+            map_shape=shape,
+            world=self._batch.worlds[index],
+        )
+
+    def _make_filter(self) -> SafetyFilter:
+        """The filter of the task, made once."""
+        if self._filter is None:
+            self._filter = self.config.make_filter()
+        return self._filter
+
+    def senses(self, robots: NDArray[np.int64]) -> Senses:
+        """What some robots know now, as a driver is told it.
+
+        Args:
+            robots: Their numbers, ``[N]``.
+
+        Returns:
+            The senses. The maps change as the robots drive, the rest is a copy.
+        """
+        batch = self._batch
+        observations = batch.observations[robots]
+        return Senses(
+            robots=robots,
+            observations=observations,
+            states=observations[:, None],
+            motions=batch.measured()[robots],
+            poses=batch.episodes.motions[robots, :3],
+            goals=batch.episodes.goals[robots],
+            maps=self.maps,
+            find_still=partial(batch.standing, robots) if self.config.plan == "known" else None,
+        )
+
     def check_task(
         self,
         index: int,
@@ -219,12 +285,11 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         return self._batch.trail(index)
 
     def walkers(self, index: int) -> NDArray[np.float64]:
-        """The walkers around a robot: (x, y), velocities and radii, ``[K, 5]`` [m, m/s, m]."""
-        return self._batch.walkers.of(index)
+        """Walkers, then the other robots of its team, around a robot, ``[K, 5]``.
 
-    def standing(self, robots: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Sectors in which robots see walls that their plan has, and nothing else, ``[N, S]``."""
-        return self._batch.standing(robots)
+        Rows have (x, y), velocity and radius [m, m/s, m].
+        """
+        return self._batch.moving(index)
 
     def set_seed(self, seed: int | Sequence[int | None]) -> None:
         """Seed the episodes that begin from now on, without beginning any.
@@ -262,12 +327,14 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         seeded = read_seed(seed, self.num_envs)
         chosen = read_reset_mask(options, self.num_envs)
         given = read_tasks(options, self.num_envs, self._source)
+        if self.team > 1:
+            check_starts(chosen, given, self.team, self.config.robot.radius)
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
         self._begin(chosen, self._seeded | seeded, given)
         self._begun = True
         self._batch.sense(chosen, self._rngs)
-        return self._batch.observations.copy(), self._infos(chosen)
+        return self._batch.observations.copy(), self._batch.infos(chosen)
 
     def step(
         self, actions: NDArray[np.float32], *, only: NDArray[np.bool_] | None = None
@@ -313,10 +380,10 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         infos: dict[str, Any] = {}
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos = self._final_infos(ended)
+            infos = self._batch.final_infos(ended)
             self._begin(ended, self._seeded)
             self._batch.sense(ended, self._rngs)
-        infos = self._infos(None) | infos
+        infos = self._batch.infos(None) | infos
         return self.observations, rewards, terminated, truncated, infos
 
     def _begin(
@@ -338,22 +405,8 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         for index, episode in zip(robots, episodes, strict=True):
             self._seeded.pop(index, None)
             self._batch.begin(index, episode, rngs[index])
-
-    def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """The infos of the chosen robots, or of all: an array for each key, and its mask."""
-        # Rows of one table, as copies one by one would take longer than all the rest.
-        masks = np.empty((len(_MASKS), self.num_envs), dtype=np.bool_)
-        masks[:] = True if chosen is None else chosen
-        flags, numbers = self.info_tables
-        return dict(zip(_INFO_KEYS, (*flags, *numbers, *masks), strict=True))
-
-    def _final_infos(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
-        """The last observations and infos of the robots whose episodes have ended, ``[N]``."""
-        seen = np.full(self.num_envs, None, dtype=object)
-        for index in np.flatnonzero(ended).tolist():
-            seen[index] = self._batch.observations[index].copy()
-        infos = self._infos(ended)
-        return {"final_obs": seen, "_final_obs": ended, "final_info": infos, "_final_info": ended}
+        if self._batch.team is not None:
+            self._batch.team.begin(self._batch.episodes, chosen)
 
     def _describe(self) -> dict[str, Any]:
         """Plain values by name: the arguments that decide what happens next."""

@@ -9,14 +9,15 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.deploy.maneuvers import stands_still
+from mpfa_envs.control.standing import stands_still
+from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, sct, spl
 from mpfa_envs.planners.dynamic_window import DynamicWindow
@@ -24,121 +25,11 @@ from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.robots.resolve import resolve_robot
-from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.tasks.sampling import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
-Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""A policy: a function from observation to action."""
-
 ENVS_AT_ONCE = 64
 """Episodes that run together by default, if the policy is known to take many observations."""
-
-
-@runtime_checkable
-class Driver(Protocol):
-    """A policy with privileged access to the environment that the robot is in."""
-
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Prepare for the episode of a robot, ``env.tasks[robot]`` in ``env.worlds[robot]``."""
-
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Actions ``[N, 2]`` of the N robots whose episodes run, by number.
-
-        Args:
-            env: The environment; ``env.poses`` says where the robots are.
-            robots: Numbers of the robots, ``[N]``.
-            observations: Their observations, ``[N, O]``.
-        """
-
-
-class ObservationDriver:
-    """A policy as a :class:`Driver`, which sees the observations alone."""
-
-    def __init__(self, policy: Action, *, alone: bool = False) -> None:
-        self.policy = policy
-        self.alone = alone
-
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Nothing is prepared."""
-
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """One action for each observation."""
-        if self.alone:
-            action = np.asarray(self.policy(observations[0]), dtype=np.float32)
-            if action.shape != (2,):
-                raise ValueError(
-                    f"policy must give an action of shape (2,) for one observation, got {action!r}"
-                )
-            return action[None]
-        actions = np.asarray(self.policy(observations), dtype=np.float32)
-        if actions.shape != (len(observations), 2):
-            raise ValueError(
-                f"policy must give actions of shape {(len(observations), 2)} for observations of "
-                f"shape {observations.shape}, got {actions.shape}; one that takes a single "
-                "observation runs with envs_at_once=1"
-            )
-        return actions
-
-
-class Filtered:
-    """A policy, or a driver, whose actions pass a filter: a :class:`Driver`.
-
-    Args:
-        policy: As for :func:`run_tasks`.
-        keep: From observations, ``[N, O]``, and actions, ``[N, 2]``, to the actions that are
-            carried out, ``[N, 2]``; a :class:`~mpfa_envs.SafetyFilter`, say.
-
-    Examples:
-        >>> from mpfa_envs import TaskConfig, evaluate
-        >>> from mpfa_envs.evaluation.runs import Filtered
-        >>> task = {"robot": "kobuki", "physics": "kinematic"}
-        >>> ahead = lambda observations: np.ones((len(observations), 2))
-        >>> careful = Filtered(ahead, TaskConfig(**task).make_filter())
-        >>> sum(each.collision for each in evaluate(careful, "D", episodes=5, **task))
-        0
-    """
-
-    def __init__(
-        self,
-        policy: Action | Driver,
-        keep: Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]],
-    ) -> None:
-        self.policy, self.keep = policy, keep
-        self._driver = as_driver(policy)
-        self.env_arguments: dict[str, Any] = dict(getattr(policy, "env_arguments", {}))
-        """Those of the policy."""
-
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Prepare the driver for the episode of a robot."""
-        self._driver.begin(env, robot)
-
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """The driver's actions, filtered."""
-        actions, keep = self._driver.drive(env, robots, observations), self.keep
-        if isinstance(keep, SafetyFilter) and keep.body.approach and env.config.plan == "known":
-            return keep(observations, actions, still=env.standing(robots))
-        return keep(observations, actions)
-
-
-def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
-    """A policy, or a driver, as a :class:`Driver`."""
-    return policy if isinstance(policy, Driver) else ObservationDriver(policy, alone=alone)
 
 
 def evaluate(
@@ -156,7 +47,7 @@ def evaluate(
 
     Args:
         policy: A :class:`~mpfa_envs.Policy`, any function from observation to action, or a
-            :class:`Driver`.
+            :class:`~mpfa_envs.driver.Driver`.
         world: What :func:`~mpfa_envs.world_tasks` takes: a world, or ``"bars:test"``, the test
             worlds of a generator; or several of these.
         episodes: Number of tasks in each; None: 200 in a world, 400 in the worlds of a generator.
@@ -216,7 +107,7 @@ def run_tasks(
         tasks: Tasks with their worlds.
         envs_at_once: How many episodes run together, which changes no result of a
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
-            wheels; None: 64 for one, a :class:`Driver` or a
+            wheels; None: 64 for one, a :class:`~mpfa_envs.driver.Driver` or a
             :class:`~mpfa_envs.planners.DynamicWindow`, else one at a time.
         progress_bar: If True, show one.
         on_end: Called at the end of every episode with the environment, the number of the robot,
@@ -351,14 +242,16 @@ def drive_steps(
             observations, info = _begin(env, tasks, at_work, begun)
             decided[begun], decisions[begun] = 0.0, 0
         for robot in np.flatnonzero(begun).tolist():
+            errand = env.errand(robot)
             start = time.process_time()
-            driver.begin(env, robot)
+            driver.begin(robot, errand)
             planned[robot] = time.process_time() - start
         running = at_work >= 0
         robots = np.flatnonzero(running)
         actions = np.zeros((env.num_envs, 2), np.float32)
+        senses = env.senses(robots)
         start = time.process_time()
-        actions[running] = driver.drive(env, robots, observations[running])
+        actions[running] = driver.drive(senses)
         decided[running] += (time.process_time() - start) / len(robots)
         decisions[running] += 1
         yield Step(observations, info, actions, [])

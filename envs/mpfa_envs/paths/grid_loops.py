@@ -263,6 +263,7 @@ def path_lengths(
     limit: float,  # [m]
     last: tuple[int, int] = (-1, -1),  # Cells much farther than this one are left out.
     buckets: int = _BUCKETS,  # More than the longest move has steps.
+    beyond: float = _BEYOND,  # Steps by which cells may be farther than the last one.
 ) -> NDArray[np.float64]:
     """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
     # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
@@ -300,7 +301,7 @@ def path_lengths(
             continue
         settled[i, j] = True
         if i == last[0] and j == last[1]:
-            limit = min(limit, lengths_to[i, j] + _BEYOND * step)
+            limit = min(limit, lengths_to[i, j] + beyond * step)
         if entries + len(moves) > len(cells):
             cells, nexts = _twice(cells), _twice(nexts)
         for k in range(len(moves)):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mpfa_envs.checks import check_choice, got
+from mpfa_envs.control.predictive import PredictiveControl
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import (
@@ -16,9 +17,12 @@ from mpfa_envs.planners.map_planner import (
     path_length,
     shortest_path,
 )
-from mpfa_envs.planners.predictive import PredictiveControl
+from mpfa_envs.planners.piloted import pilot_of
 from mpfa_envs.robots.resolve import RobotChoice
 from mpfa_envs.sensing.observation import Memory
+
+if TYPE_CHECKING:
+    from mpfa_envs.deploy.pilot import Pilot
 
 __all__ = [
     "PLANNERS",
@@ -29,6 +33,7 @@ __all__ = [
     "PurePursuit",
     "Search",
     "WindowScore",
+    "make_pilot",
     "make_planner",
     "path_length",
     "shortest_path",
@@ -88,3 +93,33 @@ def make_planner(
     if name == "ant_colony":
         return MapPlanner(AntColony(seed=seed), robot=robot, resolution=_COARSE)
     return MapPlanner(shortest_path, robot=robot)
+
+
+def make_pilot(name: str, *, robot: RobotChoice, seed: int = 0, **options: Any) -> Pilot:
+    """Make a pilot of a planner, which drives a robot without a policy.
+
+    Args:
+        name: One of :data:`PLANNERS`; those that know the map need a ``plan`` when they begin.
+        robot: What drives; its file says where the lidar is and what it sees.
+        seed: As for :func:`make_planner`.
+        **options: Of the :class:`~mpfa_envs.deploy.Pilot`. The ``clearance`` is that of the filter
+            by default, if the robot can stop.
+
+    Returns:
+        The pilot.
+
+    Raises:
+        ValueError: If there is no such planner, or an option is out of its range.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs.deploy import Scan
+        >>> from mpfa_envs.planners import make_pilot
+        >>> pilot = make_pilot("mpc", robot="kobuki")
+        >>> pilot.begin(goal=(3.0, 0.0))
+        >>> scan = Scan(-np.pi, np.pi / 180, np.full(360, 5.0), 0.1, 10.0)
+        >>> pilot.decide(scan, pose=(0.0, 0.0, 0.0), speeds=(0.0, 0.0)).linear > 0.5
+        True
+    """
+    memory: Memory = "map" if name == "dwa" else "none"
+    return pilot_of(make_planner(name, robot=robot, memory=memory, seed=seed), **options)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
-from mpfa_envs.env.vector import VectorNavigationEnv
+from mpfa_envs.driver import Errand, Senses
 from mpfa_envs.paths.distance import MANY_CELLS, DistanceField, FreeGrid
 from mpfa_envs.paths.grid_loops import STEP_SCALE
 from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel
@@ -269,8 +269,22 @@ _FINE: Final = 0.05
 """Side of a cell of the grid for it [m]."""
 
 
+class _Frame:
+    """A world's frame, in which places of another frame are looked up."""
+
+    def __init__(self, pose: tuple[float, float, float]) -> None:
+        self._x, self._y, self.heading = pose
+        self._cosine, self._sine = math.cos(self.heading), math.sin(self.heading)
+
+    def place(self, x: float, y: float) -> Point:
+        """A place of the other frame in this one [m]."""
+        across, up = x - self._x, y - self._y
+        cosine, sine = self._cosine, self._sine
+        return across * cosine + up * sine, up * cosine - across * sine
+
+
 class MapPlanner:
-    """Plans on the known map and follows the path, a :class:`~mpfa_envs.evaluation.runs.Driver`.
+    """Plans on the known map and follows the path, a :class:`~mpfa_envs.driver.Driver`.
 
     It knows all obstacles and the robot's pose, neither of which is in the observation: its results
     are a ceiling for policies that have the lidar alone.
@@ -312,26 +326,30 @@ class MapPlanner:
         self.look_ahead = check_positive("look_ahead", look_ahead)
         self.env_arguments: dict[str, Any] = {"robot": self.robot, "physics": "kinematic"}
         """Arguments of the environments that it drives in, unless others are given."""
-        self._pursuits: dict[int, PurePursuit] = {}
+        self._followed: dict[int, tuple[PurePursuit, _Frame]] = {}
         self._grids: dict[tuple[float, float], FreeGrid] = {}
 
-    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Plan the path of a robot's episode, which has begun."""
-        task = env.tasks[robot]
-        if task is None:
-            raise ValueError(f"robot {robot} must have begun an episode to plan for")
-        path, grid = self.plan(env.worlds[robot], task.start[:2], task.goal)
-        self._pursuits[robot] = PurePursuit(path, self.robot, grid, look_ahead=self.look_ahead)
+    def begin(self, robot: int, errand: Errand) -> None:
+        """Plan the path of a robot's errand.
 
-    def drive(
-        self,
-        env: VectorNavigationEnv,
-        robots: NDArray[np.int64],
-        observations: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+        Raises:
+            ValueError: If the errand has no world.
+        """
+        if errand.world is None:
+            raise ValueError("world must be known to a planner of paths, got an errand without")
+        to_world = _Frame(errand.world_pose)
+        start, goal = to_world.place(*errand.start[:2]), to_world.place(*errand.goal)
+        path, grid = self.plan(errand.world, start, goal)
+        pursuit = PurePursuit(path, self.robot, grid, look_ahead=self.look_ahead)
+        self._followed[robot] = pursuit, to_world
+
+    def drive(self, senses: Senses) -> NDArray[np.float32]:
         """Actions that follow the paths of the N robots, ``[N, 2]``; observations are not read."""
-        poses = env.poses
-        actions = [self._pursuits[robot].act(*poses[robot].tolist()) for robot in robots.tolist()]
+        actions = []
+        for robot, pose in zip(senses.robots.tolist(), senses.poses.tolist(), strict=True):
+            pursuit, to_world = self._followed[robot]
+            x, y = to_world.place(pose[0], pose[1])
+            actions.append(pursuit.act(x, y, pose[2] - to_world.heading))
         return np.array(actions, dtype=np.float32)
 
     def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:

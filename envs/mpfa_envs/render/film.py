@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from mpfa_envs.checks import check_count, check_positive
+from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.runs import Action, Driver, as_driver, drive_steps
+from mpfa_envs.evaluation.runs import drive_steps
 from mpfa_envs.scene import colors
 from mpfa_envs.scene.canvas import FINE, font
 from mpfa_envs.scene.colors import GRID, LINES, PAPER, TEXT

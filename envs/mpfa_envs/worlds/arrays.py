@@ -43,7 +43,8 @@ class BatchArrays(NamedTuple):
     boxes: NDArray[np.float64]
     """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
     circles: NDArray[np.float64]
-    """(x, y, radius) [m], ``[N, most circles, 3]``; walkers come after the cylinders."""
+    """(x, y, radius) [m], ``[N, most circles, 3]``; after the cylinders come walkers, then the
+    other robots of a team."""
     segments: NDArray[np.float64]
     """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
     polygon_ends: NDArray[np.int64]

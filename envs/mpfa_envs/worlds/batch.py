@@ -14,10 +14,12 @@ from mpfa_envs.worlds.world import World
 class WorldBatch:
     """A world for each of many robots; setting one copies its shapes and nothing else."""
 
-    # Walkers have a row each behind the cylinders, for others to write where they are.
+    # Walkers have a row each behind the cylinders, and then the other robots of a team, for others
+    # to write where they are.
 
-    def __init__(self, worlds: Sequence[World]) -> None:
+    def __init__(self, worlds: Sequence[World], *, mates: int = 0, radius: float = 0.0) -> None:
         robots = len(worlds)
+        self._mates = [(0.0, 0.0, radius)] * mates
         self._worlds = list(worlds)
         self._arrays = BatchArrays(
             np.empty((robots, 2)),
@@ -30,7 +32,7 @@ class WorldBatch:
             np.full(robots, -1),
         )
         self._grids: list[OccupancyGrid] = []
-        # The same without the walkers.
+        # The same without what moves.
         self._standing = self._arrays.counts.copy()
         for robot, world in enumerate(worlds):
             self[robot] = world
@@ -42,7 +44,7 @@ class WorldBatch:
 
     @property
     def standing(self) -> BatchArrays:
-        """The same arrays with counts that leave out walkers."""
+        """The same arrays with counts that leave out walkers and the other robots."""
         return self._arrays._replace(counts=self._standing)
 
     def __len__(self) -> int:
@@ -56,15 +58,15 @@ class WorldBatch:
 
     def __setitem__(self, robot: int, world: World) -> None:
         rows = world.arrays
-        walkers = [(0.0, 0.0, walker.radius) for walker in world.walkers]
-        if walkers:
-            rows = rows._replace(circles=np.concatenate((rows.circles, walkers)))
+        moving = [(0.0, 0.0, walker.radius) for walker in world.walkers] + self._mates
+        if moving:
+            rows = rows._replace(circles=np.concatenate((rows.circles, moving)))
         shapes = rows._asdict()
         half_size = shapes.pop("half_size")
         counts = [len(shape) for shape in shapes.values()]
         self._arrays = with_row(self._arrays, robot, half_sizes=half_size, counts=counts, **shapes)
         self._standing[robot] = self._arrays.counts[robot]
-        self._standing[robot, 1] -= len(walkers)
+        self._standing[robot, 1] -= len(moving)
         self._worlds[robot] = world
         self._arrays.grid_of[robot] = -1
         if world.occupancy is not None:
