@@ -2,6 +2,7 @@
 
     pip install 'torchrl-mpfa[irsim]'
     python examples/ir_sim.py                              td3-rooms, twenty tasks in rooms
+    python examples/ir_sim.py --latency 0.3                orders act late, as the pilot knows
     python examples/ir_sim.py --walkers 4 --behavior rvo --picture drives.png
 
 Each task is one of this package's validation worlds, written as a world of ir-sim, whose robot,
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections import Counter
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -167,7 +168,7 @@ def drive(pilot: Pilot, world: dict[str, Any], goal: tuple[float, float], seed: 
     """Drive one task in ir-sim.
 
     Args:
-        pilot: The pilot, of the robot in the world.
+        pilot: The pilot, of the robot in the world. Orders act as late as its latency says.
         world: What :func:`irsim_world` gave.
         goal: The goal (x, y) [m].
         seed: Seed of the simulator.
@@ -184,6 +185,7 @@ def drive(pilot: Pilot, world: dict[str, Any], goal: tuple[float, float], seed: 
         env = irsim.make(str(path), display=False, log_level="ERROR", seed=seed)
     robot, order, due = env.robot, (0.0, 0.0), 0.0
     wanted = order
+    under_way: deque[tuple[float, tuple[float, float]]] = deque()
     pilot.begin(goal, map_center=(0.0, 0.0))
     trail: list[tuple[float, float]] = []
     outcome, time = "timeout", 0.0
@@ -205,14 +207,32 @@ def drive(pilot: Pilot, world: dict[str, Any], goal: tuple[float, float], seed: 
             )
             try:
                 command = pilot.decide(scan, pose, order, time=time)
-                wanted = command.linear, command.angular
+                chosen = command.linear, command.angular
             except ScanError:
-                wanted = 0.0, 0.0
+                chosen = 0.0, 0.0
+            under_way.append((time + pilot.latency, chosen))
+        while under_way and time >= under_way[0][0] - 1e-9:
+            _, wanted = under_way.popleft()
         order = pilot.ramp(order, wanted, STEP)
         env.step(np.array(order).reshape(2, 1))
         time += STEP
     env.end(ending_time=0.0)
     return Drive(outcome, time, abs(order[0]), trail)
+
+
+def table(drives: Sequence[Drive]) -> str:
+    """Return what the drives come to: how many arrived and touched, how fast, in what time."""
+    touched = [end.speed for end in drives if end.outcome == "collision"]
+    times = [end.time for end in drives if end.outcome == "success"]
+    cells = {
+        "tasks": str(len(drives)),
+        "arrived": str(len(times)),
+        "touched": str(len(touched)),
+        "touch speed [m/s]": f"{max(touched):.2f}" if touched else "-",
+        "mean time [s]": f"{np.mean(times):.1f}" if times else "-",
+    }
+    values = "  ".join(value.rjust(len(name)) for name, value in cells.items())
+    return f"{'  '.join(cells)}\n{values}"
 
 
 def draw(tasks: Sequence[WorldTask], drives: Sequence[Drive], path: Path) -> None:
@@ -247,17 +267,34 @@ def main(arguments: Sequence[str] | None = None) -> list[Drive]:
     parser.add_argument("policy", nargs="?", default="td3-rooms", help="(default: td3-rooms)")
     parser.add_argument("--worlds", default="rooms:validation", help="(default: rooms:validation)")
     parser.add_argument("--episodes", type=int, default=20, help="tasks (default: 20)")
+    parser.add_argument(
+        "--latency",
+        type=float,
+        default=0.0,
+        help="of orders, which the pilot knows [s] (default: 0)",
+    )
     parser.add_argument("--walkers", type=int, default=0, help="in each world (default: none)")
     parser.add_argument(
         "--behavior", choices=["rvo", "dash"], default="rvo", help="of walkers (default: rvo)"
     )
     parser.add_argument("--clearance", type=float, default=0.02, help="[m] (default: 0.02)")
+    parser.add_argument(
+        "--approach",
+        type=float,
+        default=0.0,
+        help="speed of walkers before which the robot stands [m/s] (default: 0)",
+    )
     parser.add_argument("--picture", type=Path, help="file for the paths in the first world")
     options = parser.parse_args(arguments)
     drives = []
     with tempfile.TemporaryDirectory() as folder:
         policy = export_policy(load_policy(options.policy), Path(folder) / "policy.onnx")
-        pilot = Pilot.load(policy, clearance=options.clearance)
+        pilot = Pilot.load(
+            policy,
+            clearance=options.clearance,
+            approach=options.approach,
+            latency=options.latency,
+        )
     tasks = world_tasks(options.worlds, episodes=options.episodes, robot=pilot.robot)
     for number, each in enumerate(tasks):
         crowd = {"walkers": options.walkers, "behavior": options.behavior, "seed": number}
@@ -265,8 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Drive]:
         drives.append(drive(pilot, world, each.task.goal, number))
         end = drives[-1]
         print(f"{each.world.name}: {end.outcome} after {end.time:.1f} s at {end.speed:.2f} m/s")
-    counts = Counter(end.outcome for end in drives)
-    print(", ".join(f"{count} {name}" for name, count in counts.items()))
+    print(table(drives))
     if options.picture is not None:
         draw(tasks, drives, options.picture)
         print(f"written: {options.picture}")

@@ -159,6 +159,7 @@ TASK_PAGES = [
     "planners.md",
     "policies.md",
     "tasks.md",
+    "teams.md",
     "traps.md",
     "vector.md",
     "worlds.md",

@@ -14,8 +14,9 @@ nor PyBullet. ``examples/export.py`` writes the files that it reads.
 from __future__ import annotations
 
 from mpfa_envs.deploy.card import Card, CardError, Network, card_file, read_exported
+from mpfa_envs.deploy.command import Command
 from mpfa_envs.deploy.map_path import GoalError
-from mpfa_envs.deploy.pilot import Command, Pilot
+from mpfa_envs.deploy.pilot import Pilot
 from mpfa_envs.sensing.scan import Scan, ScanError
 from mpfa_envs.sensing.sectors import Points, Sectors
 

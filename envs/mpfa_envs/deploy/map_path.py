@@ -15,7 +15,7 @@ from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.reach import closes_in
 from mpfa_envs.sensing.hits import Hits
 from mpfa_envs.sensing.map_loops import UNKNOWN
-from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
+from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory, clearances_of
 from mpfa_envs.sensing.sectors import Points
 from mpfa_envs.worlds.world import World
 
@@ -120,7 +120,10 @@ class Plan(NamedTuple):
 
 
 class MapPath:
-    """A map around a place, which forgets what has left, and the path over it to the goal."""
+    """A map around a place, the path over it to the goal, and whether there is one.
+
+    The map forgets what rays look through, but for what the plan has.
+    """
 
     def __init__(self, card: Card) -> None:
         # Without Numba the loops would run, but a thousand times more slowly.
@@ -130,12 +133,13 @@ class MapPath:
         lidar: Any = SimpleNamespace(**rays, max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
         self._center = np.zeros(2)
-        self._hits, self._far = Hits(), card.max_range
-        self._radius = card.robot.radius
+        self._hits, self._planned = Hits(RESOLUTION), self._memory.arrays.levels[0]
+        self._rim, self._far = card.robot.radius, card.max_range
         # The loops are compiled by their first call, which takes seconds.
         self.begin((0.0, 0.0), (10.0, 10.0))
         here = np.zeros(3)
         self.sense(here, here, (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
+        self._forget(np.zeros((1, 2), dtype=np.int64))
         self.closes_in((1.0, 0.0), 0.5, (0.0, 0.0))
 
     def begin(
@@ -144,13 +148,26 @@ class MapPath:
         """Begin a map of a size around a place [m], empty or with what a plan knows."""
         self._center[:] = center
         extent: Any = SimpleNamespace(size=size)
+        memory, walls = self._memory, None
         if plan is None:
-            self._hits.begin(center, size)
-            self._memory.begin(0, extent)
+            memory.begin(0, extent)
         else:
-            self._hits.begin(center, size, plan.world, (*plan.middle, plan.pose[2]))
             x, y = np.subtract(plan.middle, center).tolist()
-            self._memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
+            memory.begin(0, extent, plan=plan.world, pose=(x, y, plan.pose[2]))
+        columns, rows = memory.arrays.shapes[0].tolist()
+        origin = memory.arrays.origins[0] + self._center
+        if plan is not None:
+            pose = *plan.middle, plan.pose[2]
+            away = clearances_of(plan.world, pose, origin, (columns, rows))
+            walls = away <= 0.5 * RESOLUTION
+        self._hits.begin((columns, rows), origin, walls)
+        self._planned = memory.arrays.levels[0].copy()
+
+    def _forget(self, cells: NDArray[np.int64]) -> None:
+        """Make the map around cells again, from which what was there has gone."""
+        self._hits.lower(self._memory.arrays.levels[0], self._planned, cells, self._memory.bounds)
+        # Paths may be cheaper now.
+        self.look_again()
 
     @property
     def arrays(self) -> MapArrays:
@@ -165,14 +182,14 @@ class MapPath:
         return columns, rows
 
     def look_again(self) -> None:
-        """The goal has moved: no path to it is known."""
+        """The goal or the map is another one: no path is known."""
         self._memory.arrays.costs[0] = UNKNOWN
 
     def closes_in(
         self, goal: tuple[float, float], radius: float, place: tuple[float, float]
     ) -> bool:
         """Return True if what is known keeps a place from within a radius of a goal [m]."""
-        return closes_in(self._hits, self._radius, goal, radius, place)
+        return closes_in(self._hits.walls, self._hits.origin, self._rim, goal, radius, place)
 
     def reject_closed(
         self, goal: tuple[float, float], radius: float, place: tuple[float, float]
@@ -192,10 +209,8 @@ class MapPath:
         points: Points,
     ) -> NDArray[np.float64]:
         """Enter points taken at a pose; direction (x, y) and length of the path, ``[1, 3]``."""
-        x, y, heading = taken[:3].tolist()
-        left = self._hits.see(x, y, points.angles + heading, points.ranges, self._far)
-        if len(left):
-            self._memory.forget(0, left, self._hits.places - self._center)
+        if len(emptied := self._hits.see(taken, points, self._far)):
+            self._forget(emptied)
         poses = np.zeros((2, 1, 5))
         poses[:, 0, :3] = pose[:3], taken[:3]
         poses[:, 0, :2] -= self._center

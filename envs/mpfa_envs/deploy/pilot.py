@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from mpfa_envs.deploy.adaptation import (
 )
 from mpfa_envs.deploy.asked import Asked, rescued
 from mpfa_envs.deploy.card import Card, Network, check_finite, read_exported
+from mpfa_envs.deploy.command import Command
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import pair_of
@@ -39,19 +40,6 @@ if TYPE_CHECKING:
 
 _TOWARDS: Final = math.radians(45.0)
 """A robot drives where it sees all directions that differ from its own by less [rad]."""
-
-
-class Command(NamedTuple):
-    """Speeds until the next decision."""
-
-    left: float
-    """Speed of the left wheel [m/s]."""
-    right: float
-    """Speed of the right wheel [m/s]."""
-    linear: float
-    """The same as the body's forward speed [m/s],"""
-    angular: float
-    """and its turning speed, to the left [rad/s]."""
 
 
 class Pilot:
@@ -84,14 +72,12 @@ class Pilot:
         approach: Speed of what may come, before which the filter has it stand [m/s]: all that is
             seen and what that hides, walls too, but those of a plan.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
-            it [s]; None: that of the robot. The pilot drives the orders under way first, and
-            decides for the state that it comes to; its filter allows for an error of 0.05 s, and
-            for wheels that are slower by a fifth.
+            it [s]; None: that of the robot. The pilot decides for the state that it comes to by the
+            orders under way. Its filter allows for 0.05 s more or less, and for slower wheels.
         goal_radius: Distance from the goal at which it has arrived [m]; None: as in training.
-            Nearer to the goal, or with a heading there, the robot drives so slowly that it stops
-            where it arrives.
-        rescue: If True, and there are a map and a filter, predictive control leads the robot away
-            where it stands still again (:class:`~mpfa_envs.control.rescue.Rescued`).
+            Near it the robot drives so slowly that it stops where it arrives.
+        rescue: If True, and there are a map and a filter, a planner leads the robot away where it
+            stands still again (:class:`~mpfa_envs.control.rescue.Rescued`).
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -434,7 +420,8 @@ class Pilot:
     def _make_filter(self) -> SafetyFilter:
         """The filter of this pilot, or the one that it would have."""
         made = self._planned = self._keep or self._planned or self._filter(CLEARANCE)
-        assert made is not None
+        if made is None:
+            raise ValueError("driver must be one without a filter, for a robot that has none")
         return made
 
     def _command(self, linear: float, angular: float) -> Command:

@@ -1,9 +1,4 @@
-"""Whether walls that were seen close a goal in.
-
-The paths of the policy's map lead through blocked cells at a price, as a robot may have to leave
-one. Here a cell is a wall only while hits on it outweigh the rays that have passed it since, so
-that a person who walks on, or one noisy scan, closes nothing for good.
-"""
+"""Whether walls close a goal in."""
 
 from __future__ import annotations
 
@@ -18,8 +13,6 @@ from mpfa_envs.sensing.map_memory import RESOLUTION
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.sensing.hits import Hits
-
 _SLIM: Final = 0.05
 """A passage may be this much narrower than the robot on either side, as hits are noisy [m]."""
 _NEAR: Final = 0.3
@@ -27,16 +20,16 @@ _NEAR: Final = 0.3
 
 
 def closes_in(
-    hits: Hits,
-    robot_radius: float,  # [m]
-    goal: tuple[float, float],
-    radius: float,  # [m]
-    place: tuple[float, float],
+    walls: NDArray[np.bool_],  # [columns, rows]
+    origin: NDArray[np.float64],  # center of the first cell (x, y) [m]
+    rim: float,  # radius of the robot [m]
+    goal: tuple[float, float],  # [m]
+    radius: float,  # of the goal [m]
+    place: tuple[float, float],  # of the robot [m]
 ) -> bool:
-    """Return True if walls leave no path from around a place to within a radius of a goal [m]."""
-    to = (np.array(goal) - hits.origin) / RESOLUTION
-    at = (np.array(place) - hits.origin) / RESOLUTION
-    free = open_cells(hits.walls, max(math.floor((robot_radius - _SLIM) / RESOLUTION), 0))
+    """Return True if no path leads from around a place to within a radius of a goal."""
+    to, at = (np.array(goal) - origin) / RESOLUTION, (np.array(place) - origin) / RESOLUTION
+    free = open_cells(walls, max(math.floor((rim - _SLIM) / RESOLUTION), 0))
     here = cells_around(free, at, _NEAR / RESOLUTION)
     # A robot in a wall is somewhere else than it thinks.
     if not len(here):

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.deploy.maneuvers import STANDING_SIDE, STANDING_TIME
+from mpfa_envs.control.standing import STANDING_SIDE, STANDING_TIME
 from mpfa_envs.driver import Action, Driver, as_driver
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.evaluation.results import EpisodeResult

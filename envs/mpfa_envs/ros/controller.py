@@ -23,7 +23,8 @@ from mpfa_envs.ros.odometry_input import Odometry, OdometryInput
 from mpfa_envs.sensing.scan import ScanError
 
 if TYPE_CHECKING:
-    from mpfa_envs.deploy.pilot import Command, Pilot
+    from mpfa_envs.deploy.command import Command
+    from mpfa_envs.deploy.pilot import Pilot
     from mpfa_envs.ros.laser_input import LaserReading
     from mpfa_envs.sensing.scan import Scan
     from mpfa_envs.worlds.world import World

@@ -88,7 +88,7 @@ def enter_scans(
                 reach = ranges[robot, ray] / resolution
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
-                changed |= _enter(levels, from_u + reach * across, from_v + reach * up, bounds)
+                changed |= enter_hit(levels, from_u + reach * across, from_v + reach * up, bounds)
         x, y, heading = motions[robot, 0], motions[robot, 1], motions[robot, 2]
         cosine, sine = math.cos(heading), math.sin(heading)
         u = (x - maps.origins[robot, 0]) / resolution
@@ -118,7 +118,7 @@ def cell_of(place: float, count: int) -> int:
 
 
 @njit
-def _enter(
+def enter_hit(
     levels: NDArray[np.uint8], u: float, v: float, bounds: tuple[float, float, float]
 ) -> bool:
     """Enter a point that the lidar hit; return True if the map has changed."""
@@ -137,31 +137,6 @@ def _enter(
                 levels[i, j] = level
                 changed = True
     return changed
-
-
-@njit
-def forget_cells(
-    levels: NDArray[np.uint8],
-    plan: NDArray[np.uint8],  # levels that the plan gives
-    cells: NDArray[np.int64],  # whose hits have left, [C, 2]
-    points: NDArray[np.float64],  # hits that are still there, in cells, [P, 2]
-    bounds: tuple[float, float, float],
-) -> None:
-    """Give cells around some the levels that the plan and the other hits give them."""
-    nx, ny = levels.shape
-    wide = math.ceil(bounds[2]) + 1
-    low_i, low_j, high_i, high_j = nx, ny, -1, -1
-    for k in range(len(cells)):
-        i, j = cells[k, 0], cells[k, 1]
-        low_i, high_i = min(low_i, i - wide), max(high_i, i + wide)
-        low_j, high_j = min(low_j, j - wide), max(high_j, j + wide)
-        for a in range(max(i - wide, 0), min(i + wide, nx - 1) + 1):
-            for b in range(max(j - wide, 0), min(j + wide, ny - 1) + 1):
-                levels[a, b] = plan[a, b]
-    for k in range(len(points)):
-        u, v = points[k, 0], points[k, 1]
-        if low_i - wide <= u <= high_i + wide and low_j - wide <= v <= high_j + wide:
-            _enter(levels, u, v, bounds)
 
 
 @njit

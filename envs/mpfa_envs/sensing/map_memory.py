@@ -14,7 +14,6 @@ from mpfa_envs.sensing.map_loops import (
     cell_of,
     enter_scans,
     follow_path,
-    forget_cells,
 )
 from mpfa_envs.worlds.arrays import grown
 
@@ -49,6 +48,20 @@ class KnownMap(NamedTuple):
     """Centers of the cells of its path to the goal, in order (x, y) [m]."""
     resolution: float
     """Side of a cell [m]."""
+
+
+def clearances_of(
+    plan: World,
+    pose: tuple[float, float, float],
+    origin: NDArray[np.float64],
+    shape: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Distances of a grid's cells from what a plan at a pose has [m], ``[columns, rows]``."""
+    cells = np.indices(shape).reshape(2, -1).T
+    x, y = (origin + RESOLUTION * cells - pose[:2]).T
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    points = np.stack((x * cosine + y * sine, y * cosine - x * sine), axis=1)
+    return plan.clearances(points).reshape(shape)
 
 
 class MapMemory:
@@ -92,12 +105,16 @@ class MapMemory:
         )
         """The maps, as compiled loops read them."""
         self._paths = np.zeros((count, 3))
-        self._plans = [np.zeros((0, 0), dtype=np.uint8)] * count
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         radius = robot.radius
         bounds = radius + _BLOCKED, radius + _TIGHT, radius + _NEAR
         self._lengths = RESOLUTION, *bounds, lidar.max_range
         self._mount = lidar.mount
+
+    @property
+    def bounds(self) -> tuple[float, float, float]:
+        """Distances from a hit up to which cells are blocked, tight and near [m]."""
+        return self._lengths[1:4]
 
     def begin(
         self,
@@ -125,15 +142,10 @@ class MapMemory:
         arrays.levels[index] = 0
         arrays.costs[index] = UNKNOWN
         if plan is not None:
-            cells = np.indices(sides).reshape(2, -1).T
-            x, y = (arrays.origins[index] + RESOLUTION * cells - pose[:2]).T
-            cosine, sine = math.cos(pose[2]), math.sin(pose[2])
-            points = np.stack((x * cosine + y * sine, y * cosine - x * sine), axis=1)
-            clearance = plan.clearances(points).reshape(sides)
+            clearance = clearances_of(plan, pose, arrays.origins[index], (sides[0], sides[1]))
             levels[index, : sides[0], : sides[1]] = sum(
                 (clearance <= bound).astype(np.uint8) for bound in self._lengths[1:4]
             )
-        self._plans[index] = levels[index, : sides[0], : sides[1]].copy()
         self._paths[index] = 0.0
 
     def remember(
@@ -168,22 +180,6 @@ class MapMemory:
         how = self.arrays, self._lengths, self._mount
         enter_scans(motions, taken, goals, ranges, chosen, directions, *how, self._paths)
         return self._paths
-
-    def forget(self, index: int, cells: NDArray[np.int64], places: NDArray[np.float64]) -> None:
-        """Forget hits in some cells of a robot's map, and find its path again.
-
-        Args:
-            index: Number of the robot.
-            cells: Columns and rows of the cells, ``[C, 2]``.
-            places: Hits that are still there (x, y) [m], ``[P, 2]``.
-        """
-        columns, rows = self.arrays.shapes[index]
-        resolution, blocked, tight, near = self._lengths[:4]
-        bounds = blocked / resolution, tight / resolution, near / resolution
-        levels, plan = self.arrays.levels[index, :columns, :rows], self._plans[index]
-        points = (places - self.arrays.origins[index]) / resolution
-        forget_cells(levels, plan, cells, points, bounds)
-        self.arrays.costs[index] = UNKNOWN
 
     def known_map(self, index: int, x: float, y: float) -> KnownMap:
         """Give a robot's map and its path from a position, for a picture.

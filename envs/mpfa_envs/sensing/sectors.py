@@ -67,6 +67,10 @@ class Points(NamedTuple):
     ranges: NDArray[np.float64]
     """Distances from the robot's center [m], ``[P]``; the card's ``max_range`` where nothing was
     met."""
+    sensor: tuple[float, float] = (0.0, 0.0)
+    """Place of the sensor (x, y) in the robot's frame [m]."""
+    reach: float = math.inf
+    """How far a ray that met nothing has looked [m]."""
 
 
 class Sectors:
@@ -138,7 +142,7 @@ class Sectors:
         rays, around, points, _ = self._measured(scan)
         card = self.card
         view = np.abs(points.angles) <= self._edge + _EDGE
-        around = Points(around.angles[view], around.ranges[view])
+        around = around._replace(angles=around.angles[view], ranges=around.ranges[view])
         points = Points(points.angles[view], points.ranges[view])
         sector = self._index(points.angles)
         key = points.ranges
@@ -283,6 +287,7 @@ class Sectors:
             angles, distances = self._with_near(rays, angles, distances, least + _NEAR)
         missed = distances >= most
         around = self._seen_from(angles, distances, missed, *here)
+        around = around._replace(sensor=(here[0], here[1]), reach=most)
         return rays, around, self._seen_from(angles, distances, missed, *place), distances
 
     def _ends(
@@ -411,7 +416,8 @@ def observations_from(
             view = math.radians(card.field_of_view)
             look_from(
                 lidar_pose(state, robot.lidar_mount[0], robot.lidar_mount[1]),
-                *points,
+                points.angles,
+                points.ranges,
                 taken,
                 card.max_range,
                 view,
