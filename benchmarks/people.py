@@ -220,6 +220,12 @@ HALL = World(
     walkers=(Walker(radius=0.25, speed=0.45),) * 6,
 )
 """Six people who walk straight on."""
+CORRIDOR = World(
+    name="corridor",
+    size=(12.0, 6.0),
+    boxes=(Box(-4.0, 0.55, 4.0, 3.0), Box(-4.0, -3.0, 4.0, -0.55)),
+)
+"""A corridor of 1.1 m between two halls."""
 CROSSINGS = {
     f"crossing {speed:g}": World(
         name=f"crossing-{speed:g}",
@@ -232,7 +238,8 @@ CROSSINGS = {
     for speed in (0.5, 1.0, 1.5)
 }
 """Two people who cross a corridor, to and fro."""
-PLACES: dict[str, str | World] = {"rooms": "rooms:validation", "hall": HALL, **CROSSINGS}
+PLACES: dict[str, str | World] = {"rooms": "rooms:validation", "hall": HALL, "corridor": CORRIDOR}
+PLACES |= CROSSINGS
 DRIVERS = ("td3-rooms", "mpc")
 _TASKS = 20
 

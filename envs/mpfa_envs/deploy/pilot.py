@@ -118,7 +118,6 @@ class Pilot:
         self._body = body_of(card.robot, self.robot, self.pace)
         self._approach = check_not_negative("approach", approach)
         self._keep = self._filter(clearance)
-        self._still: NDArray[np.bool_] | None = None
         if check_bool("rescue", rescue) and card.memory == "map" and self._keep is not None:
             driver = rescued(driver)
         self._asked = Asked(driver, card, self._ground, self._make_filter)
@@ -410,10 +409,8 @@ class Pilot:
             reject_blind_front(blind)
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
-            if (still := self._still) is not None:
-                still[:, hidden] = False
-            wheels = left, right
-            left, right = nearest_admissible(self._keep, learned, states, wheels, old, still)
+            seen = states, self._still, hidden
+            left, right = nearest_admissible(self._keep, learned, seen, (left, right), old)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
 
