@@ -16,6 +16,7 @@ import argparse
 import csv
 import math
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from tqdm import trange
 
 from mpfa_envs import (
     Box,
+    Cylinder,
     TaskConfig,
     Walker,
     World,
@@ -37,9 +39,10 @@ from mpfa_envs.driver import Filtered
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 
 Array = NDArray[np.float64]
-COLUMNS = ("place", "driver", "approach", "count", "number", "value")
+COLUMNS = ("place", "driver", "approach", "latency", "plan", "count", "number", "value")
 SPEEDS = (0.3, 0.5, 1.0, 1.5)
 """Speeds of walkers [m/s]."""
 _ROBOTS = 64
@@ -83,7 +86,13 @@ class Touches(NamedTuple):
 
 
 def drive_among_walkers(
-    decisions: int, *, approach: float, speed: float, robot: str = "kobuki", seed: int = 0
+    decisions: int,
+    *,
+    approach: float,
+    speed: float,
+    robot: str = "kobuki",
+    known: bool = False,
+    seed: int = 0,
 ) -> Touches:
     """Drive robots by a random policy behind the filter, and count what touched them.
 
@@ -92,6 +101,7 @@ def drive_among_walkers(
         approach: What the filter allows for [m/s].
         speed: Of the walkers, which aim at the robot [m/s].
         robot: What drives.
+        known: Whether it knows two thick pillars, around which the walkers go.
         seed: Of policy, pillars and walkers.
     """
     rng = np.random.default_rng(seed)
@@ -102,8 +112,13 @@ def drive_among_walkers(
     lidar, body, step = config.make_lidar(), config.robot, config.time_step
     drives = make_drives("kinematic", body, _ROBOTS, time_step=step)
     motions, all_run = np.zeros((_ROBOTS, 5)), np.ones(_ROBOTS, dtype=np.bool_)
-    radii = np.concatenate((np.full(_WALKERS, 0.25), np.full(_PILLARS, 0.15)))
-    places = np.stack([_around(rng, _WALKERS + _PILLARS) for _ in range(_ROBOTS)])
+    pillars = np.full(2, 0.6) if known else np.full(_PILLARS, 0.15)
+    radii = np.concatenate((np.full(_WALKERS, 0.25), pillars))
+    # Around a pillar they take a path that is longer by less than the rest.
+    speed *= 0.98 if known else 1.0
+    places = np.stack([_begin(rng, known) for _ in range(_ROBOTS)])
+    plans = [_plan(each) for each in places]
+    view = math.radians(lidar.field_of_view)
     size = max(part.stop for part in parts.values())
     wanted = np.zeros((_ROBOTS, 2), np.float32)
     driving = standing = 0
@@ -112,6 +127,13 @@ def drive_among_walkers(
     for _ in trange(decisions // _ROBOTS, unit="round", disable=None):
         discs = Discs(places, radii)
         ranges = cast(motions[:, :3], lidar.angles, discs, lidar.max_range)
+        still = None
+        if known:
+            still = np.zeros((_ROBOTS, lidar.sectors), dtype=np.bool_)
+            for k, (pose, row) in enumerate(zip(motions[:, :3], ranges, strict=True)):
+                scan, far = (pose, lidar.angles, row), lidar.max_range
+                hits = standing_hits(plans[k], (0.0, 0.0, 0.0), *scan, far)
+                still[k] = standing_sectors(hits, *scan, far, pose, view, lidar.sectors)
         ranges = ranges.reshape(_ROBOTS, lidar.sectors, -1).min(axis=2)
         seen = np.zeros((_ROBOTS, size), np.float32)
         seen[:, parts["lidar"]] = near / np.maximum(ranges, near)
@@ -122,7 +144,7 @@ def drive_among_walkers(
         fast = again & (rng.random(_ROBOTS) < 0.5)
         wanted[fast] = np.sign(wanted[fast])
         wheels = np.empty((_ROBOTS, 2))
-        scale_actions(keep(seen, wanted).astype(float), body.wheel_limits, wheels)
+        scale_actions(keep(seen, wanted, still=still).astype(float), body.wheel_limits, wheels)
         for _ in range(config.action_repeat):
             before, people = motions.copy(), places[:, :_WALKERS].copy()
             drives.move(motions, all_run, wheels)
@@ -130,6 +152,8 @@ def drive_among_walkers(
             away = np.maximum(np.linalg.norm(to_robot, axis=-1, keepdims=True), 1e-9)
             walked = np.minimum(speed * step, away)
             places[:, :_WALKERS] += to_robot / away * walked
+            if known:
+                _go_around(places)
             length += float(np.abs(motions[:, 3]).sum()) * step
             moves = np.abs(motions[:, 3]) > 1e-6
             for part in np.linspace(0.0, 1.0, _FINE + 1)[1:]:
@@ -144,9 +168,35 @@ def drive_among_walkers(
         for index in np.flatnonzero(touched | (np.abs(motions[:, :2]) > 2 * _HALL).any(axis=1)):
             motions[index] = 0.0
             drives.place(int(index), 0.0, 0.0, 0.0)
-            places[index] = _around(rng, _WALKERS + _PILLARS)
+            places[index] = _begin(rng, known)
+            plans[index] = _plan(places[index])
             touched[index] = False
     return Touches(driving, standing, length)
+
+
+def _begin(rng: np.random.Generator, known: bool) -> Array:
+    """Places of walkers, then of pillars [m], ``[K, 2]``."""
+    if not known:
+        return _around(rng, _WALKERS + _PILLARS)
+    # Thick pillars at both sides of the robot leave room for a walker between them.
+    pillar, other = _around(rng, 1)[0], rng.uniform(1.2, _HALL)
+    places = np.stack((*_around(rng, _WALKERS), pillar, -pillar / np.linalg.norm(pillar) * other))
+    _go_around(places[None])
+    return places
+
+
+def _go_around(places: Array) -> None:
+    """Move walkers out of thick pillars, ``[N, K, 2]``."""
+    for pillar in range(_WALKERS, places.shape[1]):
+        off = places[:, :_WALKERS] - places[:, None, pillar]
+        away = np.linalg.norm(off, axis=-1, keepdims=True)
+        places[:, :_WALKERS] += off * (np.maximum(away, 0.85) / np.maximum(away, 1e-9) - 1.0)
+
+
+def _plan(places: Array) -> World:
+    """A plan of thick pillars."""
+    pillars = tuple(Cylinder(float(x), float(y), 0.6) for x, y in places[_WALKERS:])
+    return World(name="pillars", size=(60.0, 60.0), cylinders=pillars)
 
 
 def _around(rng: np.random.Generator, count: int) -> Array:
@@ -170,6 +220,12 @@ HALL = World(
     walkers=(Walker(radius=0.25, speed=0.45),) * 6,
 )
 """Six people who walk straight on."""
+CORRIDOR = World(
+    name="corridor",
+    size=(12.0, 6.0),
+    boxes=(Box(-4.0, 0.55, 4.0, 3.0), Box(-4.0, -3.0, 4.0, -0.55)),
+)
+"""A corridor of 1.1 m between two halls."""
 CROSSINGS = {
     f"crossing {speed:g}": World(
         name=f"crossing-{speed:g}",
@@ -182,18 +238,29 @@ CROSSINGS = {
     for speed in (0.5, 1.0, 1.5)
 }
 """Two people who cross a corridor, to and fro."""
-PLACES: dict[str, str | World] = {"rooms": "rooms:validation", "hall": HALL, **CROSSINGS}
+PLACES: dict[str, str | World] = {"rooms": "rooms:validation", "hall": HALL, "corridor": CORRIDOR}
+PLACES |= CROSSINGS
 DRIVERS = ("td3-rooms", "mpc")
 _TASKS = 20
 
 
-def drive_tasks(driver: str, place: str, *, approach: float, tasks: int = _TASKS) -> dict[str, Any]:
+def drive_tasks(
+    driver: str,
+    place: str,
+    *,
+    approach: float,
+    latency: float = 0.0,
+    plan: str = "unknown",
+    tasks: int = _TASKS,
+) -> dict[str, Any]:
     """Drive tasks of a place behind the filter; what became of them.
 
     Args:
         driver: ``mpc``, or a policy of the package.
         place: One of :data:`PLACES`.
         approach: What the filter allows for [m/s].
+        latency: Time from a scan to the order that follows from it [s].
+        plan: ``"known"`` if the robot knows the walls.
         tasks: Their number.
 
     Returns:
@@ -201,7 +268,7 @@ def drive_tasks(driver: str, place: str, *, approach: float, tasks: int = _TASKS
         and by time, and the mean time of those at the goal [s].
     """
     made = make_planner("mpc", robot="kobuki") if driver == "mpc" else load_policy(driver)
-    arguments = {**made.env_arguments, "physics": "kinematic"}
+    arguments = {**made.env_arguments, "physics": "kinematic", "latency": latency, "plan": plan}
     speeds: dict[int, float] = {}
 
     def note(env: Any, robot: int, number: int) -> None:
@@ -232,19 +299,32 @@ def rows_of(options: argparse.Namespace) -> list[list[Any]]:
 
     if not options.places:
         for speed in SPEEDS:
-            for approach in (0.0, speed):
+            for approach, plan in product((0.0, speed), options.plan):
                 found = drive_among_walkers(
-                    options.decisions, approach=approach, speed=speed, seed=options.seed
+                    options.decisions,
+                    approach=approach,
+                    speed=speed,
+                    known=plan == "known",
+                    seed=options.seed,
                 )
                 place = f"aimed {speed:g}"
                 for name, value in found._asdict().items():
-                    add(place, "random", approach, options.decisions, name, round(value, 1))
+                    add(
+                        place,
+                        "random",
+                        approach,
+                        0.0,
+                        plan,
+                        options.decisions,
+                        name,
+                        round(value, 1),
+                    )
     for place in options.places:
         for driver in DRIVERS:
-            for approach in options.approach:
-                found_tasks = drive_tasks(driver, place, approach=approach)
+            for plan, late, approach in product(options.plan, options.latency, options.approach):
+                found_tasks = drive_tasks(driver, place, approach=approach, latency=late, plan=plan)
                 for name, value in found_tasks.items():
-                    add(place, driver, approach, _TASKS, name, value)
+                    add(place, driver, approach, late, plan, _TASKS, name, value)
     return rows
 
 
@@ -257,6 +337,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of a random policy")
     parser.add_argument("--places", nargs="*", choices=PLACES, default=[], help="drive tasks there")
     parser.add_argument("--approach", type=float, nargs="+", default=[0.0, 0.5, 1.0])
+    parser.add_argument("--latency", type=float, nargs="+", default=[0.0], help="of orders [s]")
+    parser.add_argument("--plan", nargs="+", choices=["unknown", "known"], default=["unknown"])
     parser.add_argument("--keep", type=Path, help="table to which the rows are added")
     options = parser.parse_args(arguments)
     rows = rows_of(options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,9 @@ class Senses(NamedTuple):
     """Positions (x, y) of the goals, ``[N, 2]`` [m]."""
     maps: MapArrays | None
     """The maps, whose rows are the robots' by number; None without ``memory="map"``."""
+    find_still: Callable[[], NDArray[np.bool_]] | None = None
+    """Gives whether all that is seen in a sector are walls of the plan, ``[N, sectors]``; None
+    without a plan."""
 
 
 @runtime_checkable
@@ -156,7 +159,11 @@ class Filtered:
 
     def drive(self, senses: Senses) -> NDArray[np.float32]:
         """The driver's actions, filtered."""
-        return self.keep(senses.observations, self._driver.drive(senses))
+        actions, keep = self._driver.drive(senses), self.keep
+        # What comes is all the same to other filters, and finding the walls takes time.
+        if senses.find_still is None or not getattr(getattr(keep, "body", None), "approach", 0.0):
+            return keep(senses.observations, actions)
+        return cast("SafetyFilter", keep)(senses.observations, actions, still=senses.find_still())
 
 
 def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:

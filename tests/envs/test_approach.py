@@ -27,6 +27,15 @@ def test_walkers_that_aim_at_a_robot_touch_it_only_where_it_stands(speed: float)
     assert found.standing > 50 and found.length > 50.0
 
 
+@pytest.mark.parametrize("speed", [0.5, 1.0])
+def test_walkers_behind_walls_that_a_robot_knows_touch_it_only_where_it_stands(
+    speed: float,
+) -> None:
+    found = drive_among_walkers(6_400, approach=speed, speed=speed, known=True, seed=1)
+    assert found.driving == 0
+    assert found.standing > 50 and found.length > 50.0
+
+
 def test_walkers_that_are_faster_than_the_filter_allows_for_touch_a_driving_robot() -> None:
     assert drive_among_walkers(3_200, approach=0.5, speed=0.7, seed=1).driving > 20
 
@@ -108,6 +117,34 @@ def test_what_a_near_obstacle_hides_may_come_out_on_both_sides_of_it() -> None:
     assert counts[0] == rays.shape[1] and (points[0, : counts[0], 3] == 0.0).all()
 
 
+def test_a_wall_that_stays_hides_what_may_come_out_beside_it_from_its_edge_on() -> None:
+    keep, lidar = CONFIG.make_filter(approach=1.0), CONFIG.make_lidar()
+    ranges, post = np.full(lidar.sectors, 10.0), 7
+    ranges[post] = 0.5
+    known = np.zeros((1, lidar.angles.size), np.bool_)
+    known[0, post * 3 : post * 3 + 3] = True
+    seen = (*keep.seen(observed(CONFIG, ranges)[None])[:4], known)
+    points = np.empty((1, room_for_points(lidar.angles.size, 1.0), 4))
+    counts = np.empty(1, np.int64)
+    see(seen, keep.body, 0.0, points, counts)
+    found = points[0, : counts[0]]
+    hits, hidden = found[found[:, 2] > 0.0], found[found[:, 2] == 0.0]
+    assert len(hits) == 3 and (hits[:, 3] == 0.0).all() and (hidden[:, 3] == 1.0).all()
+    away = np.sort(np.hypot(*hidden[:, :2].T))
+    assert away[:2] == pytest.approx(0.5) and away[2] > 0.54
+
+
+def test_a_known_wall_in_full_view_slows_a_robot_no_more_than_one_where_nothing_moves() -> None:
+    keep, still = CONFIG.make_filter(approach=1.0), CONFIG.make_filter()
+    wall, fast = observed(CONFIG, ahead_is(CONFIG, 0.5), 0.3, 0.3), command(0.3)
+    known = np.ones(CONFIG.make_lidar().sectors, np.bool_)
+    assert (still(wall, fast) == fast).all() and (keep(wall, fast) != fast).any()
+    everywhere = observed(CONFIG, 0.5, 0.3, 0.3)
+    assert (keep(everywhere, fast, still=known) == fast).all()
+    with pytest.raises(ValueError, match="still must have shape"):
+        keep(wall, fast, still=known[1:])
+
+
 def test_directions_out_of_view_hold_nothing_that_comes() -> None:
     half = TaskConfig(**task(), contact=True, lidar={"field_of_view": 180.0})
     keep = half.make_filter(approach=1.0)
@@ -149,9 +186,9 @@ def test_a_pilot_allows_for_its_latency_the_age_of_the_scan_and_its_pace(
     asked: list[float | None] = []
     among = SafetyFilter.among
 
-    def note(keep: SafetyFilter, *words: Any, age: float | None = None) -> Any:
+    def note(keep: SafetyFilter, *words: Any, age: float | None = None, **others: Any) -> Any:
         asked.append(age)
-        return among(keep, *words, age=age)
+        return among(keep, *words, age=age, **others)
 
     monkeypatch.setattr(SafetyFilter, "among", note)
     facts = card(robot=ROBOTS["kobuki"], field_of_view=360.0, sectors=36)

@@ -168,14 +168,18 @@ def reject_blind_front(blind: NDArray[np.float64]) -> None:
 def nearest_admissible(
     keep: SafetyFilter,
     robot: RobotModel,  # of the policy
-    states: NDArray[np.float32],  # observations that the filter allows for, [S, O]
+    # Observations that the filter allows for, [S, O], their sectors of known walls, [S, sectors],
+    # or None, and the sectors that are not seen, [sectors]
+    seen: tuple[NDArray[np.float32], NDArray[np.bool_] | None, NDArray[np.bool_]],
     wheels: tuple[float, float],  # speeds [m/s]
     age: float,  # of what is seen when the speeds are ordered [s]
 ) -> tuple[float, float]:
     """Speeds of the wheels nearest to those wanted that the filter allows [m/s]."""
+    states, still, hidden = seen
+    still = None if still is None else still & ~hidden
     slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
     action = (2.0 * np.array(wheels, np.float32) - slow - fast) / (fast - slow)
-    return robot.wheel_speeds(keep.among(states, action, age=age))
+    return robot.wheel_speeds(keep.among(states, action, age=age, still=still))
 
 
 def cannot_turn(robot: RobotModel) -> ScanError:

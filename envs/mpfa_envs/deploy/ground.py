@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
+from mpfa_envs.sensing.observation import lidar_pose
+from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,6 +25,7 @@ class Ground:
 
     def __init__(self, card: Card, map_size: float) -> None:
         side = check_positive("map_size", map_size)
+        self._card = card
         self._map_size = side if card.memory == "map" else None
         # Its loops are compiled before the first decision is due.
         self.map = MapPath(card) if card.memory == "map" else None
@@ -81,6 +85,24 @@ class Ground:
         """Reject a goal that is not on the map of a robot at a place."""
         if self.goal is not None:
             check_on_map(self.goal, self._center or place, self.plan, self._map_size)
+
+    def standing(
+        self,
+        states: NDArray[np.float64],  # poses of the robot first, [S, 5]
+        taken: NDArray[np.float64],  # pose of the scan, [3]
+        points: Points,
+    ) -> NDArray[np.bool_] | None:
+        """Sectors of each state that hold walls of the plan alone, ``[S, sectors]``; or None."""
+        if self.plan is None:
+            return None
+        card, plan = self._card, self.plan
+        scan, far = (taken, points.angles, points.ranges), card.max_range
+        hits = standing_hits(plan.world, (*plan.middle, plan.pose[2]), *scan, far)
+        view, mount = math.radians(card.field_of_view), card.robot.lidar_mount[:2]
+        places = [lidar_pose(state, *mount) for state in states]
+        return np.array(
+            [standing_sectors(hits, *scan, far, place, view, card.sectors) for place in places]
+        )
 
     def path(
         self,

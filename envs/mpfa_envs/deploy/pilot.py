@@ -69,7 +69,8 @@ class Pilot:
             position; the path leads through it alone. With a plan the map is as large as that.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
             filter, as for a robot that cannot stop.
-        approach: Speed of what may come, walls too, before which the filter has it stand [m/s].
+        approach: Speed of what may come, before which the filter has it stand [m/s]: all that is
+            seen and what that hides, walls too, but those of a plan.
         latency: Time from a scan to the moment at which the wheels take the order that follows from
             it [s]; None: that of the robot. The pilot decides for the state that it comes to by the
             orders under way. Its filter allows for 0.05 s more or less, and for slower wheels.
@@ -334,6 +335,7 @@ class Pilot:
             self._asked.begin()
         ranges, points = self.sectors.read(scan)
         path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
+        self._still = self._ground.standing(ahead, taken, points) if self._approach else None
         facts = self.goal, self._ground.is_new, path, self.pace
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
@@ -407,7 +409,8 @@ class Pilot:
             reject_blind_front(blind)
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
-            left, right = nearest_admissible(self._keep, learned, states, (left, right), old)
+            seen = states, self._still, hidden
+            left, right = nearest_admissible(self._keep, learned, seen, (left, right), old)
         linear = self.pace * 0.5 * (left + right)
         return self._command(linear, self.pace * (right - left) / learned.wheel_base)
 

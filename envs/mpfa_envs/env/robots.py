@@ -33,6 +33,7 @@ from mpfa_envs.sensing.observation import (
     look_from,
     observe_all,
 )
+from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.arrays import grown
@@ -299,6 +300,17 @@ class RobotBatch:
         sizes = np.array([world.size for world in self.worlds])
         seen = self.walkers.without(motions, self._lidar, self.ranges)
         return np.concatenate((motions[:, :2], sizes, held, here[:, :3], seen), axis=1)
+
+    def standing(self, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Sectors in which the chosen robots see known walls alone, ``[N, sectors]``."""
+        (here, held), lidar = self._motions(), self._lidar
+        view, rows = math.radians(lidar.field_of_view), []
+        for index in chosen.tolist():
+            taken, place = (lidar_pose(at[index], *lidar.mount) for at in (here, held))
+            scan, far = (taken, lidar.angles, self.ranges[index]), lidar.max_range
+            hits = standing_hits(self.worlds[index], (0.0, 0.0, 0.0), *scan, far)
+            rows.append(standing_sectors(hits, *scan, far, place, view, lidar.sectors))
+        return np.array(rows).reshape(len(rows), lidar.sectors)
 
     def measured(self) -> NDArray[np.float64]:
         """Motions by odometry when the next orders act, ``[N, 5]``."""

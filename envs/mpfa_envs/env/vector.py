@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -252,6 +253,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
             poses=batch.episodes.motions[robots, :3],
             goals=batch.episodes.goals[robots],
             maps=self.maps,
+            find_still=partial(batch.standing, robots) if self.config.plan == "known" else None,
         )
 
     def check_task(

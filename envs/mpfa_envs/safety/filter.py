@@ -103,7 +103,7 @@ class SafetyFilter:
         self._parts = observation_slices(sectors, memory=memory, history=history)
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
-        self._rays = len(angles) // sectors
+        self._sectors, self._rays = sectors, len(angles) // sectors
         mount, radius = np.array(self.robot.lidar_mount[:2]), self.robot.radius
         unseen = np.empty(0)
         if self.robot.can_stop:
@@ -147,13 +147,19 @@ class SafetyFilter:
         self._candidates = _candidates(check_count("samples", samples, least=2), self.body)
 
     def __call__(
-        self, observation: NDArray[np.float32], action: NDArray[np.float32]
+        self,
+        observation: NDArray[np.float32],
+        action: NDArray[np.float32],
+        *,
+        still: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float32]:
         """Filter actions.
 
         Args:
             observation: Observations, ``[..., O]``.
             action: What the policy would do, ``[..., 2]``.
+            still: True for sectors in which all that is seen is known to stand still,
+                ``[..., sectors]``; None: nothing is known.
 
         Returns:
             The actions that may be carried out, ``[..., 2]``, float32; an admissible one is as it
@@ -163,7 +169,8 @@ class SafetyFilter:
             ValueError: If the shapes do not fit, or there is NaN among them.
         """
         seen = np.asarray(observation)
-        return self.among(seen[..., None, :] if seen.ndim else seen, action)
+        states = seen[..., None, :] if seen.ndim else seen
+        return self.among(states, action, still=None if still is None else still[..., None, :])
 
     def among(
         self,
@@ -171,6 +178,7 @@ class SafetyFilter:
         action: NDArray[np.float32],
         *,
         age: float | None = None,
+        still: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float32]:
         """Filter actions of robots that may be in any of some states.
 
@@ -179,6 +187,7 @@ class SafetyFilter:
             action: What the policy would do, ``[..., 2]``.
             age: Time from what they show to the moment at which the action begins at the latest
                 [s]; None: the latency.
+            still: As when it is called, in each of the states, ``[..., S, sectors]``.
 
         Returns:
             The actions that may be carried out in all states, ``[..., 2]``, float32.
@@ -194,6 +203,9 @@ class SafetyFilter:
             raise ValueError(f"observation must have shape [..., {size}], got {shape}")
         if wanted.shape != (*seen.shape[:-2], 2):
             raise ValueError(f"action must have shape {(*seen.shape[:-2], 2)}, got {wanted.shape}")
+        sectors = (*seen.shape[:-1], self._sectors)
+        if still is not None and still.shape != sectors:
+            raise ValueError(f"still must have shape {sectors}, got {still.shape}")
         if np.isnan(seen).any() or np.isnan(wanted).any():
             raise ValueError("observation and action must not hold NaN")
         rows = seen.reshape(-1, size)
@@ -205,6 +217,7 @@ class SafetyFilter:
             self._directions,
             self._origins,
             self._wheel_speeds(rows).reshape(len(actions), -1, 2),
+            self._known(still, len(rows)).reshape(len(actions), -1, self._directions.shape[1]),
             self._candidates,
             self.body if age is None else self.body._replace(age=age),
             chosen,
@@ -216,7 +229,13 @@ class SafetyFilter:
 
     def seen(
         self, observations: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.bool_],
+    ]:
         """What a robot may meet, and how its wheels turn, as compiled loops read it.
 
         Args:
@@ -224,11 +243,20 @@ class SafetyFilter:
 
         Returns:
             Ranges of the rays [m], ``[S, R]``, infinite where they hit nothing; their directions,
-            cosine and sine, and origins (x, y) in the robot's frame [m], ``[2, R]``; and the speeds
-            of the wheels [m/s], ``[S, 2]``.
+            cosine and sine, and origins (x, y) in the robot's frame [m], ``[2, R]``; the speeds of
+            the wheels [m/s], ``[S, 2]``; and that no ray is known to hit what stays, ``[S, R]``.
         """
         rows = np.asarray(observations, dtype=np.float64)
-        return self._ranges(rows), self._directions, self._origins, self._wheel_speeds(rows)
+        known = self._known(None, len(rows))
+        return self._ranges(rows), self._directions, self._origins, self._wheel_speeds(rows), known
+
+    def _known(self, still: NDArray[np.bool_] | None, rows: int) -> NDArray[np.bool_]:
+        """Which rays are known to hit what stays, ``[N, R]``."""
+        known = np.zeros((rows, self._directions.shape[1]), dtype=np.bool_)
+        if still is not None:
+            rays = self._sectors * self._rays
+            known[:, :rays] = np.repeat(still.reshape(rows, -1), self._rays, axis=1)
+        return known
 
     def _ranges(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Ranges of all rays [m], ``[N, R]``: each may be the one that its sector reports."""

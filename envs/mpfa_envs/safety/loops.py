@@ -78,6 +78,7 @@ def filter_actions(
     directions: NDArray[np.float64],  # of the rays, cosine and sine, [2, R]
     origins: NDArray[np.float64],  # of the rays, x and y in the robot's frame [m], [2, R]
     speeds: NDArray[np.float64],  # of the wheels in each state [m/s], [N, S, 2]
+    still: NDArray[np.bool_],  # True for rays that are known to hit what stays, [N, S, R]
     candidates: NDArray[np.float64],  # actions to choose among, [K, 2]; the last one is safe
     body: Body,
     chosen: NDArray[np.float64],  # [N, 2]
@@ -93,7 +94,7 @@ def filter_actions(
     last = candidates.shape[0] - 1
     for robot in range(actions.shape[0]):
         _choose(chosen, robot, actions, robot)
-        seen = ranges[robot], directions, origins, speeds[robot]
+        seen = ranges[robot], directions, origins, speeds[robot], still[robot]
         see(seen, body, 0.0, points, counts)
         farther = _nearest(0.0, 0.0, points[0, : counts[0]], body.radius) + _GAIN
         wants = least_room(points[0, : counts[0]], body)
@@ -152,31 +153,34 @@ def least_room(points: NDArray[np.float64], body: Body) -> float:
 @njit
 def room_for_points(rays: int, approach: float) -> int:
     """Number of points that :func:`see` may write for a state."""
-    return rays * (1 + _BORDER) if approach > 0.0 else rays
+    return rays * (3 + _BORDER) if approach > 0.0 else rays
 
 
 @njit
 def see(
-    # Ranges [S, R], directions and origins [2, R] and speeds [S, 2] of a robot, as above.
-    seen: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    # Ranges [S, R], directions and origins [2, R], speeds [S, 2] and still [S, R], as above.
+    seen: tuple[
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.bool_],
+    ],
     body: Body,
     creep: float,
     points: NDArray[np.float64],  # [S, P, 4]
     counts: NDArray[np.int64],  # [S]
 ) -> None:
     """Write the near points of each state and their numbers."""
-    ranges, directions, origins, speeds = seen
+    ranges, directions, origins, speeds, still = seen
     for state in range(len(ranges)):
-        counts[state] = _near_points(
-            ranges[state], directions, origins, speeds[state], body, creep, points[state]
-        )
+        one = ranges[state], directions, origins, still[state]
+        counts[state] = _near_points(one, speeds[state], body, creep, points[state])
 
 
 @njit
 def _near_points(
-    ranges: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    origins: NDArray[np.float64],
+    rays: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]],
     speeds: NDArray[np.float64],
     body: Body,
     creep: float,  # share that may be taken of a clearance below the least
@@ -184,6 +188,7 @@ def _near_points(
     points: NDArray[np.float64],
 ) -> int:
     """Write the points that the robot may reach before it stands; their number."""
+    ranges, directions, origins, still = rays
     fastest = max(abs(body.limits.slow), abs(body.limits.fast), abs(speeds[0]), abs(speeds[1]))
     reach = fastest * body.repeat * body.time_step
     if body.limits.slow > 0.0:
@@ -213,38 +218,38 @@ def _near_points(
             distance = min(away, kept, body.radius + left) - touch
             points[count, 2] = distance * distance
             comes = body.approach > 0.0 and ray < ranges.shape[0] - body.unseen
-            points[count, 3] = 1.0 if comes else 0.0
+            points[count, 3] = 1.0 if comes and not still[ray] else 0.0
             count += 1
     if body.approach > 0.0:
-        seen = ranges[: ranges.shape[0] - body.unseen]
-        count = _add_borders(
-            seen, directions, origins, body.unseen == 0, reach + kept, points, count
-        )
+        count = _add_borders(rays, body.unseen, reach + kept, points, count)
     return count
 
 
 @njit
 def _add_borders(
-    ranges: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    origins: NDArray[np.float64],
-    around: bool,  # True if the last ray is beside the first
+    rays: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]],
+    unseen: int,  # the number of the last rays, where the lidar does not look
     reach: float,  # within which places count [m]
     points: NDArray[np.float64],
     count: int,  # of points so far
 ) -> int:
     """Add places beside nearer obstacles, from where what they hide may come; all their number."""
+    ranges, directions, origins, still = rays
+    seen = ranges.shape[0] - unseen
     apart = max(_APART, 2.0 * reach / _BORDER)
-    for ray in range(ranges.shape[0]):
+    for ray in range(seen):
         far = min(ranges[ray], reach + math.hypot(origins[0, ray], origins[1, ray]))
         for side in (-1, 1):
-            beside = (ray + side) % ranges.shape[0]
+            beside = (ray + side) % seen
             near = ranges[beside]
-            if near >= far or not (around or abs(ray - beside) == 1):
+            if near >= far or (unseen > 0 and abs(ray - beside) != 1):
                 continue
+            if still[ray] and still[beside]:  # A wall that goes on hides nothing.
+                continue
+            # Hits that may come stand for the ends of the border; those that stay do not.
             steps = min(math.ceil((far - near) / apart), _BORDER // 2)
-            for step in range(1, steps):
-                away = near + step * apart
+            for step in range(0 if still[beside] else 1, steps + (1 if still[ray] else 0)):
+                away = min(near + step * apart, far)
                 points[count, 0] = origins[0, ray] + away * directions[0, ray]
                 points[count, 1] = origins[1, ray] + away * directions[1, ray]
                 # Nothing stands there: only what moves has to be kept off.
