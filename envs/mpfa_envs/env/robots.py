@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import Episode
+    from mpfa_envs.safety.filter import SafetyFilter
     from mpfa_envs.sensing.lidar import Lidar
     from mpfa_envs.worlds.world import Task, World
 
@@ -65,6 +66,7 @@ class RobotBatch:
     ) -> None:
         count = len(worlds)
         self._config = config
+        self._filter: SafetyFilter | None = None
         self._lidar = lidar
         self.tasks: list[Task | None] = [None] * count
         """Start and goal of each robot's episode; None before the first."""
@@ -311,6 +313,12 @@ class RobotBatch:
             hits = standing_hits(self.worlds[index], (0.0, 0.0, 0.0), *scan, far)
             rows.append(standing_sectors(hits, *scan, far, place, view, lidar.sectors))
         return np.array(rows).reshape(len(rows), lidar.sectors)
+
+    def make_filter(self) -> SafetyFilter:
+        """The filter of the task, each time the same one."""
+        if self._filter is None:
+            self._filter = self._config.make_filter()
+        return self._filter
 
     def measured(self) -> NDArray[np.float64]:
         """Motions by odometry when the next orders act, ``[N, 5]``."""

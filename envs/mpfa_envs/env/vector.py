@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,9 +14,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.driver import Errand, Senses
 from mpfa_envs.env.config import TaskConfig, check_names
 from mpfa_envs.env.episodes import EpisodeSource, WorldChoice, read_state, robot_to_plain
+from mpfa_envs.env.errands import errand_of, senses_of
 from mpfa_envs.env.reset_options import (
     read_mask,
     read_reset_mask,
@@ -34,7 +33,7 @@ from mpfa_envs.worlds.world import Task, World
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.safety.filter import SafetyFilter
+    from mpfa_envs.driver import Errand, Senses
     from mpfa_envs.sensing.map_loops import MapArrays
 
 _EMPTY = World(name="empty")
@@ -145,7 +144,6 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         self._seeded: dict[int, np.random.Generator] = {}
         """Sources of randomness of the episodes that begin next, where seeds were given."""
         self._begun = False
-        self._filter: SafetyFilter | None = None
 
     def _make_batch(self) -> RobotBatch:
         """Make robots whose episodes have not begun."""
@@ -210,29 +208,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         Raises:
             ResetNeeded: If no episode has started.
         """
-        task, maps, config = self._batch.tasks[index], self.maps, self.config
-        if task is None:
-            raise ResetNeeded("there is no errand: call reset() first")
-        shape = None
-        if maps is not None:
-            columns, rows = maps.shapes[index].tolist()
-            shape = columns, rows
-        return Errand(
-            start=task.start,
-            goal=task.goal,
-            goal_radius=config.goal_radius,
-            time_step=config.time_step,
-            action_repeat=config.action_repeat,
-            make_filter=self._make_filter,
-            map_shape=shape,
-            world=self._batch.worlds[index],
-        )
-
-    def _make_filter(self) -> SafetyFilter:
-        """The filter of the task, made once."""
-        if self._filter is None:
-            self._filter = self.config.make_filter()
-        return self._filter
+        return errand_of(self._batch, self.config, index)
 
     def senses(self, robots: NDArray[np.int64]) -> Senses:
         """What some robots know now, as a driver is told it.
@@ -243,18 +219,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         Returns:
             The senses. The maps change as the robots drive, the rest is a copy.
         """
-        batch = self._batch
-        observations = batch.observations[robots]
-        return Senses(
-            robots=robots,
-            observations=observations,
-            states=observations[:, None],
-            motions=batch.measured()[robots],
-            poses=batch.episodes.motions[robots, :3],
-            goals=batch.episodes.goals[robots],
-            maps=self.maps,
-            find_still=partial(batch.standing, robots) if self.config.plan == "known" else None,
-        )
+        return senses_of(self._batch, self.config, robots)
 
     def check_task(
         self,
