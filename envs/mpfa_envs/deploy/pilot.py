@@ -100,7 +100,7 @@ class Pilot:
         approach: float = 0.0,
         latency: float | None = None,
         goal_radius: float | None = None,
-        rescue: bool = True,
+        rescue: bool = False,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
