@@ -353,6 +353,29 @@ def test_the_filter_is_there_where_the_policy_needs_it_unless_it_is_switched_off
     assert (None if keep is None else keep.body.clearance) == kept
 
 
+def test_a_planner_drives_without_a_policy() -> None:
+    rig = Rig("", driver="mpc", robot="kobuki")
+    pilot = rig.navigator.controller.pilot
+    assert pilot.has_filter and pilot.robot.name == "kobuki"
+    rig.navigator.feel(odometry(10.0, speed=0.0), 10.0)
+    rig.navigator.see(scan(10.0), 10.0)
+    rig.navigator.aim((2.0, 0.0, 0.0), "odom", 0.0, 10.0)
+    rig.navigator.feel(odometry(10.1, speed=0.0), 10.1)
+    rig.navigator.see(scan(10.1), 10.1)
+    rig.tick(10.1)
+    rig.tick(10.2)
+    assert rig.navigator.state == "driving" and rig.sent[-1][0] > 0.0
+
+
+@pytest.mark.parametrize(
+    "given", [{"driver": "mpc"}, {"driver": "mpc", "robot": "kobuki", "policy": "policy.onnx"}]
+)
+def test_a_planner_needs_a_robot_and_no_policy(given: dict[str, Any]) -> None:
+    policy = given.pop("policy", "")
+    with pytest.raises(ValueError, match="driver must be 'policy' with a policy"):
+        Rig(policy, **given)
+
+
 def test_a_lidar_outside_of_the_robot_is_an_error(tmp_path: Path) -> None:
     rig = Rig(straight(tmp_path), base="base_link")
     rig.transform = transform(0.0, x=3.0)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.card import Card
 
 PARAMETERS: Final[dict[str, Any]] = {
+    "driver": "policy",
     "policy": "",
     "robot": "",
     "pace": 0.0,
@@ -52,28 +53,47 @@ LIVE: Final = ("clearance", "goal_radius", "scan_timeout")
 
 def make_controller(value: Callable[[str], Any]) -> Controller:
     """Make the controller of a node's parameters; all loops are compiled then."""
-    card, content = read_exported(value("policy"))
-    options = dict(
-        robot=value("robot") or None,
-        pace=value("pace") or None,
-        mount=tuple(value("mount")) if any(value("mount")) else None,
-        unseen=value("unseen") or None,
-        silent=value("silent"),
-        map_size=value("map_size"),
-        clearance=_clearance(value("clearance"), card),
-        approach=value("approach"),
-        latency=None if value("latency") < 0.0 else value("latency"),
-        goal_radius=value("goal_radius") or None,
-    )
-    networks = (Network(content, card.observation_size, card.action_size) for _ in range(2))
-    rehearsing, pilot = (Pilot(card, network, **options) for network in networks)
+    make = _maker(value)
     # Loops that the first decision compiled would hold up the checks for seconds.
-    rehearse(rehearsing)
+    rehearse(make())
+    pilot = make()
     limits = {name: value(name) for name in ("stop_distance", "scan_timeout", "odometry_timeout")}
     rate = check_positive("rate", value("rate"))
     if (topic := value("map_topic")) and pilot.card.memory != "map":
         raise ValueError(f"map_topic must be '' for a policy without a map, got {topic!r}")
     return Controller(pilot, **limits, check_period=1.0 / rate)
+
+
+def _maker(value: Callable[[str], Any]) -> Callable[[], Pilot]:
+    """Make what makes the pilot, by a policy or by a planner."""
+    name, policy, robot = value("driver"), value("policy"), value("robot") or None
+    options = dict(
+        pace=value("pace") or None,
+        mount=tuple(value("mount")) if any(value("mount")) else None,
+        unseen=value("unseen") or None,
+        silent=value("silent"),
+        map_size=value("map_size"),
+        approach=value("approach"),
+        latency=None if value("latency") < 0.0 else value("latency"),
+        goal_radius=value("goal_radius") or None,
+    )
+    clearance = value("clearance")
+    if name == "policy":
+        card, content = read_exported(policy)
+        kept = _clearance(clearance, card)
+        sizes = card.observation_size, card.action_size
+        return lambda: Pilot(card, Network(content, *sizes), robot=robot, clearance=kept, **options)
+    if policy or robot is None:
+        raise ValueError(
+            f"driver must be 'policy' with a policy and without a robot, got {name!r} with "
+            f"policy={policy!r} and robot={robot!r}: a planner needs the robot alone"
+        )
+    if clearance >= 0.0:
+        options["clearance"] = clearance or None
+    # Planners need Numba, and so a second to import.
+    from mpfa_envs.planners import make_pilot
+
+    return lambda: make_pilot(name, robot=robot, **options)
 
 
 def _clearance(clearance: float, card: Card) -> float | None:
