@@ -66,6 +66,19 @@ class Senses(NamedTuple):
     """Gives whether all that is seen in a sector are walls of the plan, ``[N, sectors]``; None
     without a plan."""
 
+    def of(self, chosen: NDArray[np.bool_]) -> Senses:
+        """Return the senses of some robots, chosen by ``[N]``."""
+        find = self.find_still
+        return self._replace(
+            robots=self.robots[chosen],
+            observations=self.observations[chosen],
+            states=self.states[chosen],
+            motions=self.motions[chosen],
+            poses=self.poses[chosen],
+            goals=self.goals[chosen],
+            find_still=None if find is None else lambda: find()[chosen],
+        )
+
 
 @runtime_checkable
 class Driver(Protocol):
@@ -80,12 +93,12 @@ class Driver(Protocol):
         >>> from mpfa_envs import evaluate
         >>> class Ahead:
         ...     def begin(self, robot, errand):
-        ...         print("to", errand.goal, "within", errand.goal_radius)
+        ...         print("to be within", errand.goal_radius)
         ...
         ...     def drive(self, senses):
         ...         return np.ones((len(senses.robots), 2), np.float32)
         >>> results = evaluate(Ahead(), "A", episodes=1, physics="kinematic")
-        to (3.37, 2.79) within 0.5
+        to be within 0.5
     """
 
     def begin(self, robot: int, errand: Errand) -> None:

@@ -17,6 +17,7 @@ import ddpg
 import evaluate
 import export
 import gymnasium_td3
+import ir_sim
 import play
 import recurrent_td3
 import report
@@ -27,7 +28,7 @@ import torchrl_maddpg
 import torchrl_sac
 import torchrl_trainer
 import tune
-from benchmarks import drivers, pictures, rivals, sampling, stops
+from benchmarks import drivers, people, pictures, rivals, sampling, stops
 from benchmarks.late import __main__ as late
 from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, worlds
@@ -58,6 +59,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "recurrent_td3": recurrent_td3.main,
     "report": report.main,
     "gymnasium_td3": gymnasium_td3.main,
+    "ir_sim": ir_sim.main,
     "sb3_replay": sb3_replay.main,
     "stable_baselines": stable_baselines.main,
     "torchrl_ddpg": torchrl_ddpg.main,
@@ -72,6 +74,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "benchmarks.stops": stops.main,
     "benchmarks.drivers": drivers.main,
     "benchmarks.late": late.main,
+    "benchmarks.people": people.main,
     "benchmarks.pictures": pictures.main,
     "benchmarks.rivals": rivals.main,
     "benchmarks.sampling": sampling.main,
@@ -123,7 +126,8 @@ def understand(words: Sequence[str]) -> None:
         parse_overrides(options.overrides)
     if script == "tune":
         parse_overrides(options.settings)
-    if script in ("compare", "evaluate"):
+    # Teams have worlds of their own.
+    if script in ("compare", "evaluate") and getattr(options, "team", 1) == 1:
         files = ".yaml", ".zip"
         known = [word for word in options.worlds if not word.endswith(files)]
         assert len(parse_worlds(known)) >= len(known)

@@ -262,9 +262,9 @@ def failing(result: Any) -> Any:
     ("result", "reason"),
     [
         (MemoryError("of the runtime"), "failed: MemoryError('of the runtime')"),
-        (None, "failed: TypeError"),
-        (np.ones((0, 2), np.float32), "failed: IndexError"),
-        (np.ones((1, 3), np.float32), r"action must have shape (2,), got (3,)"),
+        (None, "policy must give actions of shape (1, 2) for observations of shape"),
+        (np.ones((0, 2), np.float32), "policy must give actions of shape (1, 2)"),
+        (np.ones((1, 3), np.float32), "policy must give actions of shape (1, 2)"),
         (
             np.full((1, 2), math.nan, np.float32),
             "the network's action must be finite, got [nan nan]",

@@ -114,18 +114,18 @@ def test_wrong_messages_stop_it_while_they_last(
 
 
 def test_a_decision_that_takes_too_long_is_not_driven(driving: Live) -> None:
-    pilot = driving.node.navigator.controller.pilot
-    decide = pilot._network
+    driver = driving.node.navigator.controller.pilot._asked._driver
+    decide = driver.policy
 
     def slowly(seen: Any) -> Any:
         time.sleep(0.7)
         return decide(seen)
 
-    pilot._network = slowly
+    driver.policy = slowly
     around = driving.around
     assert driving.until(lambda: around.sent[-1] == STANDS)
     assert driving.until(lambda: around.statuses[-1]["reason"].startswith("too late"))
-    pilot._network = decide
+    driver.policy = decide
     assert driving.until(lambda: around.sent[-1][0] > 0.1)
 
 

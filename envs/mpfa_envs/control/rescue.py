@@ -88,9 +88,8 @@ class Rescued:
             self._note(robot, places[row])
         led = np.array([self.leads(robot) for robot in senses.robots.tolist()], np.bool_)
         if led.any():
-            parts = {name: getattr(senses, name)[led] for name in Senses._fields if name != "maps"}
             actions = np.array(actions, np.float32)
-            actions[led] = self._planner.drive(senses._replace(**parts))
+            actions[led] = self._planner.drive(senses.of(led))
         return actions
 
     def _note(self, robot: int, place: list[float]) -> None:
