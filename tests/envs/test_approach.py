@@ -78,6 +78,11 @@ def stands_after(speed: float, latency: float, approach: float) -> float:
     return 0.1 * (2.0 * speed + braking.sum()) + approach * (latency + 0.2 + 0.1 * len(braking))
 
 
+def test_the_latest_order_counts_where_latencies_differ() -> None:
+    late = TaskConfig(**task(), contact=True, latency=(0.1, 0.3))
+    assert late.make_filter(approach=0.5).body.age == 0.3
+
+
 def test_turning_on_the_spot_and_standing_are_always_allowed() -> None:
     keep = CONFIG.make_filter(approach=2.0)
     close = observed(CONFIG, 0.2)

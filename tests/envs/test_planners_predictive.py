@@ -273,9 +273,10 @@ def test_a_robot_plans_from_where_its_odometry_places_it_and_behind_the_filter()
     for _ in range(12):
         env.step(planner.drive(env.senses(robots)))
     kept = planner._keep
-    assert kept is not None and env.maps is not None
-    scene = planner._scene(kept, env.maps, env.senses(robots), 0)
-    place = np.array(scene.pose[:2]) + env.maps.origins[0]
+    senses = env.senses(robots)
+    assert kept is not None and senses.maps is not None
+    scene = planner._scene(kept, senses.maps, senses, 0)
+    place = np.array(scene.pose[:2]) + senses.maps.origins[0]
     assert math.dist(place, env.measurements[0, 4:6]) < 1e-9 < math.dist(place, env.poses[0, :2])
     assert scene.goal[2] == pytest.approx(0.94 * 0.3)
     calls: list[int] = []

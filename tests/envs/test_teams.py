@@ -89,7 +89,7 @@ def test_robots_in_worlds_of_their_own_drive_as_before_beside_a_team_of_one():
 def test_the_map_of_a_robot_has_the_others_where_its_rays_met_them():
     env = pair(memory="map")
     begin(env, facing())
-    maps = env.maps
+    maps = env.senses(np.arange(env.num_envs)).maps
     resolution, levels = 0.1, maps.levels[0]
     column, row = (
         int((place - origin) / resolution + 0.5)

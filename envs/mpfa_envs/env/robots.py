@@ -222,6 +222,28 @@ class RobotBatch:
         episodes: Sequence[Episode],
         driven: Sequence[NDArray[np.float64]],  # by robot, [A, 2]
         rngs: Sequence[np.random.Generator],
+        places: NDArray[np.float64],  # where they come to (x, y) [m], [N, 2]
+    ) -> None:
+        """Begin episodes, and drive them again; an error shuts the drives down."""
+        try:
+            if episodes:
+                self._drive_again(episodes, driven, rngs)
+            # Robots that share a physics server may be off by a millimeter.
+            here = self.episodes.motions[:, :2]
+            if not np.allclose(np.reshape(places, here.shape), here, rtol=0, atol=0.01):
+                raise ValueError(
+                    "state cannot be loaded: its episodes end elsewhere when they are driven "
+                    "again, as it was changed or is of another version; begin new ones with reset()"
+                )
+        except BaseException:
+            self.drives.close()
+            raise
+
+    def _drive_again(
+        self,
+        episodes: Sequence[Episode],
+        driven: Sequence[NDArray[np.float64]],
+        rngs: Sequence[np.random.Generator],
     ) -> None:
         """Begin episodes, and drive them with the wheel speeds [m/s] of their actions."""
         counts = np.array([len(speeds) for speeds in driven])
