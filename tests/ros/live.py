@@ -26,6 +26,8 @@ from mpfa_envs.ros.messages import write_pose
 def choose_domain() -> None:
     """Keep to this machine, in a domain of this process."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # Tests kill nodes. What a killed process leaves in Fast DDS's shared memory can end others.
+    os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 
 
