@@ -5,6 +5,8 @@
     python -m benchmarks.late td3-rooms --latency 0.1 --node           the ROS node's controller
     python -m benchmarks.late td3-rooms --latency 0.1 --off -0.05      a pilot that is told 0.05 s
     python -m benchmarks.late td3-rooms --latency 0.1 --strength 0.8   weaker wheels than its file's
+    python -m benchmarks.late td3-rooms --latency 0.3 --alone          no planner leads it out
+    python -m benchmarks.late mpc --robot kobuki --latency 0.1         the planner alone
 
 The robot is a circle on a raster plan, with exact rays and wheels that accelerate; its orders act
 ``--latency`` seconds after their scan. Each seed has a building and tasks of its own, half of which
@@ -25,7 +27,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.late.building import Grid, Point, Task, building, clearance, ranges, sample_tasks
-from mpfa_envs import export_policy, load_policy
+from mpfa_envs import export_policy, load_policy, make_pilot
 from mpfa_envs.deploy import Pilot, Scan, ScanError
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.ros.controller import Controller
@@ -70,8 +72,11 @@ class Robot:
         view = self.model.field_of_view
         count = 2 * round(view)
         step = math.radians(view) / (count if view >= 360 else count - 1)
+        ahead, left, turned = self.model.lidar_mount
         first, far = -math.radians(view) / 2, self.model.lidar_range
-        seen = ranges(self.grid, self.x, self.y, self.heading + first, step, count, far)
+        x = self.x + ahead * math.cos(self.heading) - left * math.sin(self.heading)
+        y = self.y + ahead * math.sin(self.heading) + left * math.cos(self.heading)
+        seen = ranges(self.grid, x, y, self.heading + turned + first, step, count, far)
         return Scan(first, step, seen, 0.0, far)
 
     def order(self, linear: float, angular: float) -> None:
@@ -179,10 +184,18 @@ def drive(robot: Robot, driver: Driver, goal: Point, *, acceleration: float) -> 
     return "timeout"
 
 
+def pilot_of(options: argparse.Namespace, file: Path, latency: float) -> Pilot:
+    """The pilot of a policy or of the planner."""
+    if options.policy == "mpc":
+        return make_pilot("mpc", robot=options.robot, clearance=options.clearance, latency=latency)
+    rescue = not options.alone
+    return Pilot.load(file, clearance=options.clearance, latency=latency, rescue=rescue)
+
+
 def row_of(options: argparse.Namespace, file: Path, latency: float, seed: int) -> dict[str, object]:
     """Drive the tasks of a building; return their row."""
     told = round(latency + options.off, 9)
-    pilot = Pilot.load(file, clearance=options.clearance, latency=told)
+    pilot = pilot_of(options, file, told)
     model = pilot.robot
     narrow = 2 * (model.radius + _SPARE)
     grid = building(seed, narrow)
@@ -202,7 +215,7 @@ def row_of(options: argparse.Namespace, file: Path, latency: float, seed: int) -
         times += [robot.time] * arrived
     return {
         "policy": options.policy,
-        "driver": "node" if options.node else "pilot",
+        "driver": ("node" if options.node else "pilot") + " alone" * options.alone,
         "latency": latency,
         "told": told,
         "strength": options.strength,
@@ -224,7 +237,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("policy", help="a policy of the package, or an ONNX file")
+    parser.add_argument("policy", help="a policy of the package, a run, an ONNX file, or mpc")
+    parser.add_argument("--robot", default="kobuki", help="of mpc")
+    parser.add_argument("--alone", action="store_true", help="no mpc leads out where it stands")
     parser.add_argument("--latency", type=float, nargs="+", default=[0.0], help="of orders [s]")
     parser.add_argument("--off", type=float, default=0.0, help="told latency less the true one [s]")
     parser.add_argument(
@@ -238,7 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(options.policy)
-        if not file.exists():
+        if file.suffix != ".onnx" and options.policy != "mpc":
             file = export_policy(load_policy(options.policy), Path(folder) / "policy.onnx")
         rows = [
             row_of(options, file, latency, seed)

@@ -36,7 +36,7 @@ from mpfa_envs.tasks.sampling import WorldTask
 
 KOBUKI = TaskConfig(robot="kobuki", memory="map").make_filter()
 BODY = KOBUKI.body
-EFFORT = Effort(turn=0.35, stand=0.5, either=True, circle=0)
+EFFORT = Effort(turn=0.35, stand=0.5, either=True, circle=0, blind=False)
 STEPS = 16
 # A doorway of 0.5 m for a robot of 0.36 m, and a pocket before the goal.
 DOOR = World(name="door", boxes=(Box(-0.1, 0.25, 0.1, 5.0), Box(-0.1, -5.0, 0.1, -0.25)))
@@ -53,7 +53,7 @@ def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> P
     if wall < math.inf:
         beside = wall * np.tan(np.linspace(-0.9, 0.9, 61))
         points = np.stack((np.full(61, wall), beside, np.full(61, kept**2)), axis=1)[None]
-    room_around(points[0], 0.0, rooms)
+    room_around(points[0], 0.0, BODY.radius, rooms)
     lengths = np.abs(np.arange(200)[:, None] * 0.1 - 9.0 - goal) + np.zeros((1, 200))
     speeds, counts = np.array([[speed, speed]]), np.zeros(1, np.int64)
     levels, pose = np.zeros((200, 200), np.uint8), (9.0, 10.0, 0.0)
@@ -68,6 +68,7 @@ def scene(wall: float = math.inf, *, speed: float = 0.0, goal: float = 9.0) -> P
         levels,
         lengths,
         (9.0 + goal, 10.0, 0.47),
+        0.0,
     )
 
 
@@ -102,7 +103,9 @@ def test_paths_over_costly_cells_are_those_of_plain_relaxation() -> None:
 
 def test_the_room_around_is_that_over_what_the_filter_keeps() -> None:
     rooms = np.empty((61, 61))
-    room_around(np.array([(0.5, 0.1, 0.04)]), math.pi / 2, rooms)  # It looks up the map.
+    # It looks up the map. What is at the rim is not seen, and nothing stands on a border.
+    points = np.array([(0.5, 0.1, 0.04), (0.0, 0.17, 0.03), (-0.6, 0.0, 0.0)])
+    room_around(points, math.pi / 2, 0.18, rooms)
     for (column, row), room in np.ndenumerate(rooms):
         away = math.hypot(CELL * (column - 30) + 0.1, CELL * (row - 30) - 0.5) - 0.2
         assert room == pytest.approx(min(away, ROOMY))
@@ -128,6 +131,25 @@ def test_time_near_obstacles_costs_more_also_where_the_robot_begins_too_near(
     assert rollout(straight(0.7), near, BODY, EFFORT, math.inf) == pytest.approx(free + 1.6 * more)
 
 
+def test_a_robot_that_squeezes_through_may_plan_into_what_it_sees_at_a_cost() -> None:
+    near = scene(speed=0.7)._replace(rooms=np.full((1, 121, 121), ROOMY))
+    near.rooms[0, 64:, :] = -0.04
+    assert rollout(straight(0.7), near, BODY, EFFORT, math.inf) == math.inf
+    squeezed = near._replace(into=0.05)
+    free = rollout(straight(0.7), scene(speed=0.7), BODY, EFFORT, math.inf)
+    assert rollout(straight(0.7), squeezed, BODY, EFFORT, math.inf) > free + 1.0
+    assert rollout(straight(0.7), near._replace(into=0.03), BODY, EFFORT, math.inf) == math.inf
+
+
+def test_to_drive_backwards_costs_a_robot_that_does_not_see_there() -> None:
+    back = scene(speed=-0.7)
+    blind = EFFORT._replace(blind=True)
+    seen, unseen = (rollout(straight(-0.7), back, BODY, e, math.inf) for e in (EFFORT, blind))
+    assert unseen > seen + 10.0
+    ahead = [rollout(straight(0.7), scene(), BODY, e, math.inf) for e in (EFFORT, blind)]
+    assert ahead[0] == ahead[1]
+
+
 def test_a_plan_must_be_able_to_stop_after_its_end() -> None:
     # 1.12 m, 0.27 m to brake in time steps, and 0.21 m of rim and clearance.
     assert rollout(straight(0.7), scene(1.59, speed=0.7), BODY, EFFORT, math.inf) == math.inf
@@ -151,7 +173,7 @@ def test_the_cost_to_go_is_not_that_behind_a_thin_wall() -> None:
 
 def test_a_robot_that_cannot_stop_needs_a_circle_after_its_plan() -> None:
     body = TaskConfig(robot="turtlebot2", memory="map").make_filter().body
-    circle = Effort(turn=0.3, stand=0.5, either=False, circle=33)
+    circle = Effort(turn=0.3, stand=0.5, either=False, circle=33, blind=False)
     ahead = straight(0.5)
     assert rollout(ahead, scene(0.8 + 0.14 + 0.2, speed=0.5), body, circle, 99.0) == math.inf
     assert rollout(ahead, scene(0.8 + 0.14 + 0.3, speed=0.5), body, circle, 99.0) < 99.0
@@ -223,11 +245,22 @@ def test_a_narrow_door_and_a_pocket_are_left_behind() -> None:
     ]
     for robot in ("kobuki", "waffle"):
         planner = make_planner("mpc", robot=robot)
+        assert planner.env_arguments["closeness_distance"] == planner.robot.lidar_to_rim
         wide = tasks[1:] if robot == "waffle" else tasks
         assert all(each.success for each in run_tasks(planner, wide, **planner.env_arguments))
 
 
-def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
+@pytest.mark.parametrize("thick", [0.1, 0.3])
+def test_a_door_five_centimeters_wider_on_each_side_is_passed(thick: float) -> None:
+    posts = Box(-thick, 0.23, thick, 5.0), Box(-thick, -5.0, thick, -0.23)
+    door = World(name="door", boxes=posts)
+    tasks = [WorldTask(door, Task(start, (2.0, 0.0))) for start in ((-2.0, 0.4, 1.0), (-2, -1, 2))]
+    planner = make_planner("mpc", robot="kobuki")
+    results = run_tasks(planner, tasks, **planner.env_arguments)
+    assert all(each.success and each.time_s < 30.0 for each in results)
+
+
+def test_a_robot_that_does_not_come_away_squeezes_and_then_pays_for_the_path_ahead() -> None:
     planner = PredictiveControl(robot="kobuki")
     with_map = {"robot": "kobuki", "physics": "kinematic", "memory": "map", "contact": True}
     env = VectorNavigationEnv(1, world=DOOR, **with_map)
@@ -239,6 +272,9 @@ def test_a_robot_that_does_not_come_away_pays_for_the_path_ahead() -> None:
     lengths = planner._episodes[0].lengths[30:36, 54]
     assert (np.diff(lengths) < 0.0).all()
     for _ in range(15):  # It is held: nothing is driven.
+        planner.drive(env.senses(robots))
+    assert not planner._episodes[0].raised.any()
+    for _ in range(15):
         planner.drive(env.senses(robots))
     raised = planner._episodes[0].raised
     assert raised.max() == 25 and 6 <= np.count_nonzero(raised) <= 9

@@ -379,3 +379,18 @@ def test_wheels_that_brake_slowly_begin_earlier() -> None:
         return 0.0
 
     assert first_change(0.4) > first_change(0.8) + 0.1 > first_change(8.0) + 0.2
+
+
+def test_what_is_not_seen_beside_a_lidar_ahead_of_the_axle_lies_at_the_rim() -> None:
+    lidar = {"field_of_view": 270.0, "sectors": 27}
+    robot = replace(ROBOTS["kobuki"], name="own", lidar_mount=(0.1, 0.0, 0.0))
+    config = TaskConfig(**task(robot, lidar=lidar, closeness_distance=robot.lidar_to_rim))
+    keep = config.make_filter()
+    seen = observed(config, np.array([5.0] * 26 + [0.0]))
+    points = keep.seen(seen[None])
+    ends = points[2] + points[0][0] * points[1]
+    distances = np.hypot(ends[0], ends[1])
+    assert distances.min() == pytest.approx(robot.radius)
+    ahead = np.ones(2, np.float32)
+    np.testing.assert_array_equal(keep(seen, ahead), ahead)
+    assert keep(seen, -ahead).tolist() != [-1.0, -1.0]

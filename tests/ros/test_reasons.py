@@ -185,8 +185,9 @@ def test_a_small_jump_of_the_pose_is_said_and_the_robot_arrives(policy: Path, tu
     assert drive.notes[0][1].startswith("pushed, or its pose corrected: ")
 
 
-def test_a_scan_that_comes_late_while_the_robot_turns_brakes_and_keeps_the_goal(
-    policy: Path,
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_scan_that_is_late_or_lacks_rays_while_the_robot_turns_keeps_the_goal(
+    policy: Path, lost: bool
 ) -> None:
     robot = replace(ROBOTS["kobuki"], name="scout", field_of_view=240.0)
     pilot = Pilot.load(policy, robot=robot, clearance=0.03, unseen=0.3, latency=0.1)
@@ -197,10 +198,12 @@ def test_a_scan_that_comes_late_while_the_robot_turns_brakes_and_keeps_the_goal(
         controller.feel((0.0, 0.0, turned), (0.0, 2.5), now)
         if step % 5 == 0:  # The scans of a lidar with 5 Hz, now and then one less.
             ranges = np.full(241, 4.0) + 0.001 * step
+            ranges[:60] = math.nan if lost and step % 10 == 0 else ranges[:60]
             controller.see(Scan(-math.radians(120), math.radians(1), ranges, 0.1, 10.0), now)
         order = controller.tick(now)
         assert order is not None
-        told.add((order.reason.partition(" must")[0], controller.state))
+        told.add((order.reason.partition(" of ")[0], controller.state))
         assert order.reason == "driving" or order[:2] == (0.0, 0.0)
-    assert told == {("driving", "driving"), ("the scan", "waiting")}
+    brakes = {("no ray", "waiting")} if lost else set()
+    assert told == {("driving", "driving")} | brakes
     assert controller.pilot.goal is not None

@@ -13,7 +13,7 @@ from mpfa_envs.control.cost_to_go import cost_to_go
 from mpfa_envs.control.predictive_loops import CELL, Effort, PlanningState, best_plan, room_around
 from mpfa_envs.robots.motion_loops import pairs_within
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
-from mpfa_envs.safety.loops import least_room, room_for_points, see
+from mpfa_envs.safety.loops import AT_RIM, least_room, room_for_points, see
 from mpfa_envs.sensing.map_loops import BLOCKED, cell_of
 from mpfa_envs.sensing.map_memory import RESOLUTION
 
@@ -34,6 +34,8 @@ _SAMPLES: Final = 80
 """Plans that are sampled in each of three rounds."""
 _SPEEDS: Final = 5
 """Speeds of a wheel that are tried after one another."""
+_SPINS: Final = np.array([-0.5, -0.2, -0.08, 0.08, 0.2, 0.5])
+"""Turns on the spot that one which does not look behind tries, too, over its quickest."""
 _TURN: Final = 1.1
 """Angle for whose turn at full speed a radian beside the path counts [rad]."""
 _REACHED: Final = 0.94
@@ -48,6 +50,11 @@ _RAISED: Final = 25
 """By how much cells cost more before which a robot was stuck: half a meter each."""
 _MOVED: Final = 0.5
 """Distance after which lengths are found again, as those around the robot count [m]."""
+_INTO: Final = 0.06
+"""How far plans may lead into what the sectors show, where the robot squeezes through [m]. From
+afar sectors show door posts wider than they are."""
+_SQUEEZED: Final = 1.0
+"""Distance from where it was stuck within which it does [m]."""
 _AHEAD: Final = 12
 """Cells of the path ahead of a stuck robot among which the sectors show what closes it."""
 
@@ -64,6 +71,7 @@ class _Episode:
     found_at: Point = (math.inf, math.inf)  # where the robot was then, from the first cell [m]
     place: Point = (math.inf, math.inf)  # the last one that it left [m]
     waited: int = 0  # decisions since then, or since it was stuck
+    squeezed_at: Point = (math.inf, math.inf)  # where it began to squeeze through [m]
 
 
 class PredictiveControl:
@@ -84,9 +92,11 @@ class PredictiveControl:
       cannot, without coming nearer to what the sectors show than the filter keeps.
     - *Filter.* A plan begins with an action that the :class:`~mpfa_envs.SafetyFilter` lets pass, by
       the test of the filter itself.
-    - *Recovery.* If the robot does not leave a place for 2.5 s, cells of the path before it cost
-      half a meter more for the rest of the episode, as in guided local search: those where the
-      sectors show no room. So another path becomes the cheapest, in the end the one back.
+    - *Recovery.* If the robot does not leave a place for 2.5 s, its plans may lead 6 cm into what
+      the sectors show, as these show a door narrower than it is. If that does not help, cells of
+      the path before it cost half a meter more for the rest of the episode, as in guided local
+      search: those where the sectors show no room. So another path becomes the cheapest, in the end
+      the one back.
 
     Args:
         robot: Whose wheels are driven.
@@ -114,6 +124,8 @@ class PredictiveControl:
             "physics": "kinematic",
             "memory": "map",
             "action_repeat": repeat,
+            # To the rim: what is nearer than an observation shows is at the rim for the filter.
+            "closeness_distance": self.robot.lidar_to_rim,
         }
         """Arguments of the environments that it drives in, unless others are given. A slow robot
         holds its actions for longer, as its policies do."""
@@ -152,9 +164,10 @@ class PredictiveControl:
         if limits.slow > 0.0:
             whole = math.tau * body.wheel_base / (limits.fast - limits.slow)
             circle = math.ceil(whole / body.time_step)
-        either = limits.reverse and limits.slow < -0.9 * limits.fast
+        blind = body.unseen > 0
+        either = limits.reverse and limits.slow < -0.9 * limits.fast and not blind
         turn, wait = _TURN / keep.robot.max_angular_speed, _WAIT * _LENGTH / limits.fast
-        self._effort = Effort(turn, wait, either, circle)
+        self._effort = Effort(turn, wait, either, circle, blind)
         reach = limits.fast * (steps * body.time_step + 0.5 * limits.fast / limits.acceleration)
         half = math.ceil((reach + 0.1) / CELL)
         self._reach = reach + 2.0 * _MOVED
@@ -172,6 +185,10 @@ class PredictiveControl:
         for row, robot in enumerate(senses.robots.tolist()):
             scene, plan = self._scene(keep, maps, senses, row), self._episodes[robot].plan
             time = best_plan(plan, self._pairs, self._noise, scene, self._body, self._effort)
+            if time == math.inf and scene.least > -1.0:
+                # Nothing leads away from what is too near: what does not lead nearer, then.
+                scene = scene._replace(least=-1.0)
+                time = best_plan(plan, self._pairs, self._noise, scene, self._body, self._effort)
             if time == math.inf:
                 plan[:] = max(slow, 0.0)
             actions.append(2.0 * (plan[0] - slow) / (fast - slow) - 1.0)
@@ -195,8 +212,13 @@ class PredictiveControl:
         counts = np.empty(states, np.int64)
         see(seen, self._ahead, 0.0, points, counts)
         near = points[0, : counts[0]]
-        room_around(near, heading, self._rooms)
+        room_around(near, heading, self._body.radius + AT_RIM, self._rooms)
+        squeezed = math.dist(pose[:2], episode.squeezed_at) <= _SQUEEZED
         stuck = self._is_stuck(episode, pose[:2])
+        if stuck:
+            # First it tries to squeeze through, and only then another path.
+            stuck, squeezed = squeezed, not squeezed
+            episode.squeezed_at = pose[:2] if squeezed else (math.inf, math.inf)
         if stuck:
             self._penalize(episode, pose)
         target = _cell(goal, levels.shape)
@@ -209,7 +231,8 @@ class PredictiveControl:
             episode.found_at = pose[:2]
         least = least_room(near, self._body)
         field = self._rooms[None], episode.levels, episode.lengths
-        return PlanningState(pose, seen[3], points, counts, keep.body, least, *field, goal)
+        into = _INTO if squeezed else 0.0
+        return PlanningState(pose, seen[3], points, counts, keep.body, least, *field, goal, into)
 
     def _is_stuck(self, episode: _Episode, place: Point) -> bool:
         """Return True once if a robot has not left its place for a while."""
@@ -245,4 +268,8 @@ def _speeds_to_try(body: Body) -> NDArray[np.float64]:
     limits = body.limits
     speeds = np.linspace(limits.slow, limits.fast, _SPEEDS)
     slowest = np.full((1, 2), max(limits.slow, 0.0))
-    return np.concatenate((slowest, pairs_within(limits, speeds)))
+    pairs = np.concatenate((slowest, pairs_within(limits, speeds)))
+    if body.unseen == 0:
+        return pairs
+    spins = min(limits.fast, -limits.slow, limits.across) * _SPINS
+    return np.concatenate((pairs[pairs.sum(axis=1) >= 0.0], np.stack((-spins, spins), axis=1)))

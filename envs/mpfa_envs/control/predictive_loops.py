@@ -10,7 +10,7 @@ import numpy as np
 from mpfa_envs.compiled import njit
 from mpfa_envs.paths.grid_loops import interpolate
 from mpfa_envs.robots.motion_loops import changed, limited
-from mpfa_envs.safety.loops import Body, room_after
+from mpfa_envs.safety.loops import AT_RIM, Body, room_after
 from mpfa_envs.sensing.map_loops import BLOCKED, FACTORS, cell_of
 from mpfa_envs.sensing.map_memory import RESOLUTION
 
@@ -42,6 +42,7 @@ class PlanningState(NamedTuple):
     levels: NDArray[np.uint8]  # its map, [columns, rows]
     lengths: NDArray[np.float64]  # of the cheapest paths to the goal [m], [columns, rows]
     goal: tuple[float, float, float]  # x, y and the distance that reaches it [m]
+    into: float  # how far a plan may lead into what it should keep off, but its first action [m]
 
 
 class Effort(NamedTuple):
@@ -51,12 +52,14 @@ class Effort(NamedTuple):
     stand: float  # time that a plan must save to begin without moving [s]
     either: bool  # True if it drives backwards as well as forwards
     circle: int  # time steps of a full circle if it cannot stop, else 0
+    blind: bool  # True if its lidar does not look behind, where the filter lets it not drive
 
 
 @njit
 def room_around(
     points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [P, 4]
     heading: float,  # of the robot [rad]
+    rim: float,  # distance within which nothing is seen [m]
     rooms: NDArray[np.float64],  # [n, n]
 ) -> None:
     """Write how far the robot's center would be from what it must keep off, in cells around it."""
@@ -64,9 +67,11 @@ def room_around(
     middle, last = rooms.shape[0] // 2, rooms.shape[0] - 1
     cosine, sine = math.cos(heading) / CELL, math.sin(heading) / CELL
     for point in range(points.shape[0]):
-        if points[point, 2] == 0.0:  # Nothing stands there.
-            continue
         x, y, kept = points[point, 0], points[point, 1], math.sqrt(points[point, 2])
+        # Nothing stands on a border. What is not seen begins at the rim: the filter keeps off it,
+        # and after a turn it is seen.
+        if kept == 0.0 or x * x + y * y <= rim * rim:
+            continue
         u, v = middle + x * cosine - y * sine, middle + x * sine + y * cosine
         wide = (kept + ROOMY) / CELL
         for i in range(max(math.ceil(u - wide), 0), min(math.floor(u + wide), last) + 1):
@@ -101,15 +106,22 @@ def _terminal_cost(
     lengths: NDArray[np.float64],
     place: tuple[float, float, float],  # x, y, heading at a plan's end [m, m, rad]
     speed: float,  # forward there [m/s]
+    tight: bool,  # True if the robot squeezes through
     body: Body,
     effort: Effort,
 ) -> float:
     """Time from the end of a plan to the goal [s]: along the path, to turn and to accelerate."""
     x, y, heading = place
     fast = body.limits.fast
-    time = _cost_to_go(lengths, x, y) / fast
-    across = _cost_to_go(lengths, x + _OFF, y) - _cost_to_go(lengths, x - _OFF, y)
-    up = _cost_to_go(lengths, x, y + _OFF) - _cost_to_go(lengths, x, y - _OFF)
+    here = _cost_to_go(lengths, x, y)
+    time = here / fast
+    east, west = _cost_to_go(lengths, x + _OFF, y), _cost_to_go(lengths, x - _OFF, y)
+    north, south = _cost_to_go(lengths, x, y + _OFF), _cost_to_go(lengths, x, y - _OFF)
+    across, up = east - west, north - south
+    if tight:
+        # Upwind differences: in a corridor the path leads ahead, not away from the costlier wall.
+        across = math.copysign(max(here - min(east, west), 0.0), across)
+        up = math.copysign(max(here - min(north, south), 0.0), up)
     steep = math.hypot(across, up)
     if steep > 0.0:
         ahead = -(across * math.cos(heading) + up * math.sin(heading)) / steep
@@ -138,12 +150,13 @@ def rollout(
     left, right = state.speeds[0, 0], state.speeds[0, 1]
     x, y, heading = state.pose
     # Between the cells, the room of the place where it stands may seem to be below zero.
-    needed, time = min(_room_at(state, x, y), 0.0) - 1e-9, 0.0
+    needed, time = min(_room_at(state, x, y), 0.0) - state.into - 1e-9, 0.0
     step, last = 0, plan.shape[0]
     while True:
         if step == last:
             place = x, y, heading
-            time += _terminal_cost(state.lengths, place, 0.5 * (left + right), body, effort)
+            speed = 0.5 * (left + right)
+            time += _terminal_cost(state.lengths, place, speed, state.into > 0.0, body, effort)
         if time >= most:
             return math.inf
         if step < last:
@@ -166,11 +179,12 @@ def rollout(
             if room < needed:
                 return math.inf
         if step < last:
-            near = 1.0 - max(room, 0.0) / ROOMY
+            near = 1.0 - max(room, -state.into) / ROOMY
             time += body.time_step * (1.0 + near * near)
             column = cell_of(x / RESOLUTION, state.levels.shape[0])
             # A wall that the lidar does not see from here: the sectors show what is before it.
-            if state.levels[column, cell_of(y / RESOLUTION, state.levels.shape[1])] == BLOCKED:
+            level = state.levels[column, cell_of(y / RESOLUTION, state.levels.shape[1])]
+            if level == BLOCKED or (effort.blind and left + right < -AT_RIM):
                 time += _WALL * body.time_step
             if math.hypot(x - state.goal[0], y - state.goal[1]) <= state.goal[2]:
                 return time
@@ -228,7 +242,10 @@ def _better(
 ) -> float:
     """Choose a plan if it is better than the best so far, and the filter lets it begin so [s]."""
     # A robot that stands sees the same again: to wait for a better plan must not be free.
-    slow = 1.0 - min(max(abs(trial[0, 0]), abs(trial[0, 1])) / body.limits.fast, 1.0)
+    fastest = max(abs(trial[0, 0]), abs(trial[0, 1]))
+    if effort.blind:  # While it turns it sees less of what is beside it, and may not drive on.
+        fastest = 0.5 * abs(trial[0, 0] + trial[0, 1])
+    slow = 1.0 - min(fastest / body.limits.fast, 1.0)
     waits = effort.stand * slow * slow
     time = rollout(trial, state, body, effort, best - waits) + waits
     if time >= best:

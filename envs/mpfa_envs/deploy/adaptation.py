@@ -157,12 +157,26 @@ def filter_of(
 
 
 def reject_blind_front(blind: NDArray[np.float64]) -> None:
-    """Reject a scan that does not look at directions [rad] beside which a filter lets it drive."""
+    """Reject a scan that does not look at directions [rad] beside which a filter lets it drive.
+
+    They are from ahead when it was taken: what a turn since then hides is at the rim for a filter.
+    """
     if (np.cos(blind) > _BESIDE).any():
         raise ScanError(
             "the scan must look at all directions up to 90 degrees from ahead for the "
             "filter (clearance), which does not drive beside what is not seen"
         )
+
+
+def on_the_spot(
+    robot: RobotModel, learned: RobotModel, left: float, right: float
+) -> tuple[float, float]:
+    """Speeds of the wheels that turn on the spot in place of others [m/s]."""
+    most = min(learned.max_wheel_speed, -learned.min_wheel_speed)
+    if most <= 0.0:
+        raise cannot_turn(robot)
+    turn = min(max(0.5 * (right - left), -most), most)
+    return -turn, turn
 
 
 def nearest_admissible(

@@ -9,6 +9,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.deploy.map_path import MapPath, Plan, check_on_map, pair_of, plan_at, sides_of
+from mpfa_envs.sensing.glances import Glances
 from mpfa_envs.sensing.observation import lidar_pose
 from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
+    from mpfa_envs.robots.model import RobotModel
     from mpfa_envs.sensing.sectors import Points
     from mpfa_envs.worlds.world import World
 
@@ -23,12 +25,20 @@ if TYPE_CHECKING:
 class Ground:
     """A goal, and the map and the plan in which it lies; all in the frame of the odometry."""
 
-    def __init__(self, card: Card, map_size: float) -> None:
+    def __init__(
+        self,
+        card: Card,
+        map_size: float,  # [m]
+        *,
+        robot: RobotModel,
+        moves: bool,  # True if something may come
+    ) -> None:
         side = check_positive("map_size", map_size)
         self._card = card
         self._map_size = side if card.memory == "map" else None
         # Its loops are compiled before the first decision is due.
         self.map = MapPath(card) if card.memory == "map" else None
+        self.glances = Glances(card, robot, moves=moves)
         self.goal: tuple[float, float] | None = None
         """The goal (x, y) [m]; None without."""
         self.plan: Plan | None = None
@@ -112,8 +122,12 @@ class Ground:
         *,
         radius: float,  # of the goal [m]
         place: tuple[float, float],  # of the robot; that of the map if it begins now
+        time: float,  # of the decision [s]
     ) -> NDArray[np.float64]:
         """Enter points taken at a pose; the path from another, ``[0, 3]`` or as that of the map."""
+        if self.begins:
+            self.glances.begin()
+        self.glances.add(taken, points, time)
         if self.map is None or self.goal is None:
             return np.zeros((0, 3))
         if self.begins:

@@ -13,6 +13,7 @@ from mpfa_envs.deploy.adaptation import (
     cannot_turn,
     filter_of,
     nearest_admissible,
+    on_the_spot,
     pace_of,
     ramped,
     reject_blind_front,
@@ -24,6 +25,7 @@ from mpfa_envs.deploy.command import Command
 from mpfa_envs.deploy.ground import Ground
 from mpfa_envs.deploy.maneuvers import Arrival, WayBack
 from mpfa_envs.deploy.map_path import pair_of
+from mpfa_envs.deploy.rehearsal import rehearse
 from mpfa_envs.robots.drives import OFF, Orders
 from mpfa_envs.robots.resolve import RobotChoice, resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
@@ -100,7 +102,7 @@ class Pilot:
         approach: float = 0.0,
         latency: float | None = None,
         goal_radius: float | None = None,
-        rescue: bool = False,
+        rescue: bool = True,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -114,9 +116,9 @@ class Pilot:
         self._arrival = Arrival(
             self.robot, card, goal_radius, pace=self.pace, period=self.period, latency=self.latency
         )
-        self._ground = Ground(card, map_size)
-        self._body = body_of(card.robot, self.robot, self.pace)
         self._approach = check_not_negative("approach", approach)
+        self._ground = Ground(card, map_size, robot=self.robot, moves=approach > 0.0)
+        self._body = body_of(card.robot, self.robot, self.pace)
         self._keep = self._filter(clearance)
         if check_bool("rescue", rescue) and card.memory == "map" and self._keep is not None:
             driver = rescued(driver)
@@ -128,7 +130,7 @@ class Pilot:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **options: Any) -> Pilot:
-        """Read an exported policy.
+        """Read an exported policy, and compile loops, which takes seconds at the first time.
 
         Args:
             path: The ONNX file; its card lies next to it.
@@ -143,6 +145,7 @@ class Pilot:
         """
         card, content = read_exported(path)
         network = Network(content, card.observation_size, card.action_size)
+        rehearse(cls(card, network, **options))
         return cls(card, network, **options)
 
     @property
@@ -165,8 +168,7 @@ class Pilot:
     def _filter(self, clearance: float | None) -> SafetyFilter | None:
         """Make the filter that keeps a clearance [m]; None: no filter."""
         # At a slower pace things come faster, in the policy's time.
-        facts = self.card, self.robot, self._body
-        return filter_of(*facts, clearance, self._approach / self.pace)
+        return filter_of(self.card, self.robot, self._body, clearance, self._approach / self.pace)
 
     @property
     def recoveries(self) -> int:
@@ -334,7 +336,9 @@ class Pilot:
         if self._ground.begins:
             self._asked.begin()
         ranges, points = self.sectors.read(scan)
-        path = self._ground.path(ahead[0], taken, points, radius=self.goal_radius, place=(x, y))
+        path = self._ground.path(
+            ahead[0], taken, points, radius=self.goal_radius, place=(x, y), time=self._time
+        )
         self._still = self._ground.standing(ahead, taken, points) if self._approach else None
         facts = self.goal, self._ground.is_new, path, self.pace
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
@@ -385,13 +389,12 @@ class Pilot:
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
         rows, ahead, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
         blind, hidden = self.sectors.blind(scan, turn)
-        goal = self._ground.goal or pose[:2]
+        learned, goal = self.card.robot, self._ground.goal or pose[:2]
         slower = self._arrival.fastest(pose, goal)
-        # Whatever the policy reads in them, sectors that are not seen begin at the rim.
+        # Whatever the policy reads in them, what was not seen begins at the rim.
         states = rows.copy()
-        states[:, : self.card.sectors][:, hidden] = 1.0
+        states[:, : self.card.sectors][:, hidden] = self._ground.glances.closeness(ahead, hidden)
         action = self._asked.act(rows, states, ahead, goal, self.goal_radius)
-        learned = self.card.robot
         reverses = not (np.abs(blind) > math.pi - _TOWARDS).any()
         back = self._way_back.speeds(pose, self._time, reverses=reverses, led=self._asked.is_led)
         left, right = back or learned.wheel_speeds(action)
@@ -400,13 +403,9 @@ class Pilot:
         towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
         backwards = left + right < 0.0 and not self.robot.reverse
         if backwards or (np.abs(towards) < _TOWARDS).any():
-            most = min(learned.max_wheel_speed, -learned.min_wheel_speed)
-            if most <= 0.0:
-                raise cannot_turn(self.robot)
-            right = min(max(0.5 * (right - left), -most), most)
-            left = -right
+            left, right = on_the_spot(self.robot, learned, left, right)
         if self._keep is not None:
-            reject_blind_front(blind)
+            reject_blind_front(blind + turn)
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
             seen = states, self._still, hidden

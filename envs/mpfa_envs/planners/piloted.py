@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 from mpfa_envs.deploy.card import Card
 from mpfa_envs.deploy.pilot import Pilot
+from mpfa_envs.deploy.rehearsal import rehearse
 from mpfa_envs.env.config import TaskConfig
+from mpfa_envs.planners.map_planner import MapPlanner
 from mpfa_envs.safety.filter import CLEARANCE
 
 if TYPE_CHECKING:
     from mpfa_envs.control.predictive import PredictiveControl
     from mpfa_envs.planners.dynamic_window import DynamicWindow
-    from mpfa_envs.planners.map_planner import MapPlanner
 
 
 def pilot_of(planner: MapPlanner | DynamicWindow | PredictiveControl, **options: Any) -> Pilot:
@@ -20,6 +21,8 @@ def pilot_of(planner: MapPlanner | DynamicWindow | PredictiveControl, **options:
     card = card_of(TaskConfig(**planner.env_arguments | {"memory": "map"}))
     if card.robot.can_stop:
         options.setdefault("clearance", CLEARANCE)
+    if not isinstance(planner, MapPlanner):  # That one plans in a world which is not known yet.
+        rehearse(Pilot(card, planner, **options))
     return Pilot(card, planner, **options)
 
 

@@ -263,8 +263,9 @@ class SafetyFilter:
         closeness = rows[:, self._parts["lidar"]]
         closeness = np.repeat(closeness, self._rays, axis=1)
         ranges = self._near / np.maximum(closeness, 1e-9)
-        # An obstacle nearer than the observation can show may be at the rim.
-        ranges = np.where(closeness >= 1.0, np.minimum(self._near, self._rims), ranges)
+        # What is nearer than the observation can show may be at the rim, but not inside of it: so
+        # is what the lidar has not seen.
+        ranges = np.where(closeness >= 1.0, self._rims, ranges)
         ranges[ranges >= 0.999 * self._max_range] = math.inf
         # What is not seen begins at the rim, which may leave it but not approach it.
         unseen = np.full((len(rows), self._unseen), self.robot.radius)

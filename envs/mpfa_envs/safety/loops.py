@@ -64,7 +64,7 @@ _DIP = 0.003
 """By how much the distance may be below that of the tested places, in time and on borders [m]."""
 _TOUCH = 1e-9
 """Rounding of distances [m]."""
-_AT_RIM = 1e-6
+AT_RIM = 1e-6
 """The same of what is at the rim, as what is not seen: speeds of an observation are rounded, and a
 robot that turns could not stop for the nanometers that it drives then."""
 
@@ -214,7 +214,7 @@ def _near_points(
             room = away - body.radius
             left = min(_LEAST * body.clearance, (1.0 - creep) * room)
             left = max(left, (1.0 - _SHARE) * room)
-            touch = _TOUCH if room > _AT_RIM else _AT_RIM
+            touch = _TOUCH if room > AT_RIM else AT_RIM
             distance = min(away, kept, body.radius + left) - touch
             points[count, 2] = distance * distance
             comes = body.approach > 0.0 and ray < ranges.shape[0] - body.unseen
