@@ -145,6 +145,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="the filter has the robot stand before what comes at this speed [m/s] (default: 0)",
     )
     parser.add_argument(
+        "--rescue",
+        action="store_true",
+        help="predictive control leads a robot on that stands still again, as a Pilot does",
+    )
+    parser.add_argument(
         "--plan",
         choices=["unknown", "known"],
         help="known: the robot's map begins with the world's walls (default: as in training)",
@@ -176,11 +181,15 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             options.filter = bool(options.approach) or needs_filter(options.loaded)
         if options.approach and not options.filter:
             raise ValueError(f"--approach must be 0 with --no-filter, got {options.approach}")
+        if options.rescue and not options.filter:
+            raise ValueError("--rescue must come with --filter, got none")
         options.asked = conditions(options)
         check_physics(options.asked.physics)
         task = TaskConfig(**options.loaded.env_arguments | options.asked.arguments)
         if options.filter:
             task.make_filter(approach=options.approach)
+        if options.rescue and task.memory != "map":
+            raise ValueError("--rescue must come with a map, got memory='none'")
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -203,6 +212,7 @@ def conditions(options: argparse.Namespace) -> Conditions:
         {name: value for name, value in task.items() if value is not None},
         options.team,
         options.right_of_way,
+        options.rescue,
     )
 
 
@@ -376,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             print(f"warning: {sentence}")
     driver: Drivable = policy
     if asked.filtered:
-        driver = filtered(policy, approach=asked.approach, **asked.arguments)
+        driver = filtered(policy, approach=asked.approach, rescue=asked.rescue, **asked.arguments)
     folder = options.output or output_folder(options)
     if options.live:
         return show_live(driver, options)

@@ -20,6 +20,7 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.control.rescue import Rescued
 from mpfa_envs.driver import Filtered
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
@@ -31,7 +32,9 @@ from mpfa_envs.safety.filter import CLEARANCE
 from training.files import short_name
 from training.worlds import worlds_label
 
-_AS_TRAINED = ("plan", "goal_radius", "filter", "noise", "latency", "robot", "team", "right_of_way")
+_AS_TRAINED = (
+    "plan", "goal_radius", "filter", "noise", "latency", "robot", "team", "right_of_way", "rescue"
+)  # fmt: skip
 """Conditions that an evaluation has no entry of where they are as in the training."""
 Drivable = Policy | MapPlanner | DynamicWindow | PredictiveControl | Filtered
 """Drivers of a robot, with the ``env_arguments`` that they need."""
@@ -84,6 +87,8 @@ class Conditions:
     """Robots in a world."""
     right_of_way: bool = False
     """True if robots wait for those of a lower number."""
+    rescue: bool = False
+    """True if predictive control leads a robot on that stands still again."""
 
     @property
     def folder(self) -> str:
@@ -98,6 +103,7 @@ class Conditions:
             f"evaluation-{worlds_label(self.words)}-{self.physics}",
             "-filter" if self.filtered else "",
             f"-approach{self.approach:g}" if self.approach else "",
+            "-rescue" if self.rescue else "",
             f"-{self.robot.name}" if self.robot is not None else "",
             *(f"-{name}-{value}" for name, value in self.task.items()),
             f"-team{self.team}" if self.team > 1 else "",
@@ -128,6 +134,7 @@ class Conditions:
             "robot": self.robot and asdict(self.robot),
             "team": self.team if self.team > 1 else None,
             "right_of_way": self.right_of_way or None,
+            "rescue": self.rescue or None,
         }
         document = {"words": list(self.words), **tasks, **self.task}
         return document | {name: value for name, value in others.items() if value is not None}
@@ -162,10 +169,13 @@ def on_robot(policy: Policy, robot: RobotChoice | None) -> Policy:
     return moved
 
 
-def filtered(policy: Drivable, *, approach: float = 0.0, **env_arguments: Any) -> Filtered:
+def filtered(
+    policy: Drivable, *, approach: float = 0.0, rescue: bool = False, **env_arguments: Any
+) -> Filtered:
     """Put a policy behind the filter that keeps the robot off obstacles that its lidar sees."""
     config = TaskConfig(**policy.env_arguments | env_arguments)
-    return Filtered(policy, config.make_filter(approach=approach))
+    driver = Rescued(policy) if rescue else policy
+    return Filtered(driver, config.make_filter(approach=approach))
 
 
 def needs_filter(policy: Drivable) -> bool:

@@ -23,6 +23,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
+from training.doors import drive_through_doors, is_asked
 from training.finished import after_the_end, is_finished, nothing_learned
 from training.inherited import forget_single_run
 from training.plugins import with_plugin
@@ -231,6 +232,8 @@ def _train(training: TrainingRun) -> int:
             else " (no episode has ended, and so there is no curve)"
         )
         print(f"policy: {folder / files.POLICY}{made}")
+        if training.updates and is_asked(training.settings):
+            print(drive_through_doors(folder))
         if not training.updates:
             print(nothing_learned(training.actions, training.settings.method.rows))
         return 0
