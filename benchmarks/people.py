@@ -320,7 +320,7 @@ def rows_of(options: argparse.Namespace) -> list[list[Any]]:
                         round(value, 1),
                     )
     for place in options.places:
-        for driver in DRIVERS:
+        for driver in options.drivers:
             for plan, late, approach in product(options.plan, options.latency, options.approach):
                 found_tasks = drive_tasks(driver, place, approach=approach, latency=late, plan=plan)
                 for name, value in found_tasks.items():
@@ -336,6 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--decisions", type=int, default=64_000, help="of a random policy")
     parser.add_argument("--seed", type=int, default=0, help="of a random policy")
     parser.add_argument("--places", nargs="*", choices=PLACES, default=[], help="drive tasks there")
+    parser.add_argument("--drivers", nargs="+", choices=DRIVERS, default=DRIVERS)
     parser.add_argument("--approach", type=float, nargs="+", default=[0.0, 0.5, 1.0])
     parser.add_argument("--latency", type=float, nargs="+", default=[0.0], help="of orders [s]")
     parser.add_argument("--plan", nargs="+", choices=["unknown", "known"], default=["unknown"])
