@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -111,6 +112,8 @@ class Robot:
 class Driver(Protocol):
     """What decides for a robot."""
 
+    spent: list[float]
+
     def begin(self, goal: Point) -> None:
         """Begin a drive."""
 
@@ -123,6 +126,8 @@ class Piloted:
 
     def __init__(self, pilot: Pilot) -> None:
         self._pilot = pilot
+        self.spent: list[float] = []
+        """CPU time of each decision [s]."""
 
     def begin(self, goal: Point) -> None:
         """Begin a drive."""
@@ -135,11 +140,13 @@ class Piloted:
             return "arrived"
         if robot.time + 1e-9 >= self._next:
             self._next = robot.time + self._pilot.period
+            scan, began = robot.scan(), time.process_time()
             try:
-                command = self._pilot.decide(robot.scan(), robot.pose, robot.speeds)
+                command = self._pilot.decide(scan, robot.pose, robot.speeds)
                 self._speeds = command.linear, command.angular
             except ScanError:
                 self._speeds = 0.0, 0.0
+            self.spent.append(time.process_time() - began)
         return self._speeds
 
 
@@ -148,6 +155,7 @@ class Noded:
 
     def __init__(self, pilot: Pilot) -> None:
         self._pilot = pilot
+        self.spent: list[float] = []
 
     def begin(self, goal: Point) -> None:
         """Begin a drive."""
@@ -227,6 +235,7 @@ def row_of(options: argparse.Namespace, file: Path, latency: float, seed: int) -
         "least": round(least, 4),
         "spl": round(float(np.mean(shares)), 3),
         "time": round(float(np.mean(times)), 1) if times else math.nan,
+        "decision_ms": round(1e3 * float(np.mean(driver.spent)), 2) if driver.spent else math.nan,
     }
 
 

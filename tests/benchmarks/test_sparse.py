@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
 from benchmarks import sparse
+from mpfa_envs import Policy
 from training.settings.checks import check_settings
 from training.settings.command_line import composed
 from training.settings.train import register
@@ -82,6 +84,19 @@ def test_rows_of_runs_are_curves_and_what_the_last_policies_reached(
     assert sparse.main(["--kept", "--output", str(kept)]) == 0
     shown = capsys.readouterr().out.splitlines()
     assert shown == [*table, "", *sparse.search_table().splitlines()]
+
+
+@pytest.mark.parametrize(("ahead", "least", "most"), [(0.0, 0.0, 0.0), (9.0, 0.2, 0.9)])
+def test_the_share_of_changed_actions_is_none_of_a_robot_that_stands(
+    monkeypatch: pytest.MonkeyPatch, ahead: float, least: float, most: float
+) -> None:
+    task = {"robot": "kobuki", "physics": "kinematic", "closeness_distance": 0.18}
+    layer = torch.nn.Linear(42, 2)
+    torch.nn.init.zeros_(layer.weight)
+    torch.nn.init.constant_(layer.bias, ahead)
+    policy = Policy.from_layers([layer, torch.nn.Tanh()], card={}, env_arguments=task)
+    monkeypatch.setattr(sparse, "_JUDGED", 20)
+    assert least <= sparse.changed_share(policy) <= most
 
 
 def test_the_tables_of_the_page_are_those_of_the_kept_rows() -> None:
