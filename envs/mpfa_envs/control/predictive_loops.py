@@ -241,17 +241,30 @@ def _better(
     effort: Effort,
 ) -> float:
     """Choose a plan if it is better than the best so far, and the filter lets it begin so [s]."""
+    for attempt in range(2):
+        if attempt == 1:
+            # It may turn where it may not drive: a sampled plan hardly ever begins with just that.
+            turn = 0.5 * (trial[0, 1] - trial[0, 0])
+            trial[: body.repeat, 0], trial[: body.repeat, 1] = -turn, turn
+        waits = _cost_of_waiting(trial, body, effort)
+        time = rollout(trial, state, body, effort, best - waits) + waits
+        if time >= best:
+            return best
+        first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
+        if room_after(first, state.speeds, state.points, state.counts, state.kept) > state.least:
+            chosen[:] = trial
+            return time
+        if not effort.blind:
+            return best
+    return best
+
+
+@njit
+def _cost_of_waiting(trial: NDArray[np.float64], body: Body, effort: Effort) -> float:
+    """What a plan costs that begins without moving [s]."""
     # A robot that stands sees the same again: to wait for a better plan must not be free.
     fastest = max(abs(trial[0, 0]), abs(trial[0, 1]))
     if effort.blind:  # While it turns it sees less of what is beside it, and may not drive on.
         fastest = 0.5 * abs(trial[0, 0] + trial[0, 1])
     slow = 1.0 - min(fastest / body.limits.fast, 1.0)
-    waits = effort.stand * slow * slow
-    time = rollout(trial, state, body, effort, best - waits) + waits
-    if time >= best:
-        return best
-    first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
-    if room_after(first, state.speeds, state.points, state.counts, state.kept) <= state.least:
-        return best
-    chosen[:] = trial
-    return time
+    return effort.stand * slow * slow
