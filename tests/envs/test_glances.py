@@ -12,8 +12,8 @@ from mpfa_envs import ROBOTS, RobotModel, TaskConfig
 from mpfa_envs.deploy import Pilot, Scan
 from mpfa_envs.deploy.card import Card
 from mpfa_envs.planners.piloted import card_of
-from mpfa_envs.sensing.glances import Glances
-from mpfa_envs.sensing.sectors import Sectors
+from mpfa_envs.sensing.glances import Glances, nearest_hits
+from mpfa_envs.sensing.sectors import Points, Sectors
 
 SCOUT = replace(
     ROBOTS["kobuki"], name="scout", field_of_view=240.0, lidar_mount=(0.08, 0.0, 0.0), latency=0.3
@@ -40,8 +40,8 @@ def ranges(pose: tuple[float, float, float], angles: np.ndarray, post: float) ->
     cosine, sine = np.cos(angles + pose[2]), np.sin(angles + pose[2])
     with np.errstate(divide="ignore"):
         walls = np.minimum(
-            np.where(cosine > 0.0, HALF - x, -HALF - x) / cosine,
-            np.where(sine > 0.0, HALF - y, -HALF - y) / sine,
+            np.where(cosine >= 0.0, HALF - x, -HALF - x) / cosine,
+            np.where(sine >= 0.0, HALF - y, -HALF - y) / sine,
         )
     if post < math.inf:
         along = (-0.5 - x) * cosine - y * sine
@@ -56,7 +56,7 @@ def ranges(pose: tuple[float, float, float], angles: np.ndarray, post: float) ->
 def looked(*poses: tuple[float, float, float], post: float = math.inf, moves: bool = False):
     """Scans from some poses, a second after one another."""
     card = a_card()
-    glances, sectors = Glances(card, SCOUT, moves=moves), Sectors(card)
+    glances, sectors = Glances(card, SCOUT, moves=moves), Sectors(card, mount=SCOUT.lidar_mount)
     for time, pose in enumerate(poses):
         glances.add(np.array(pose), sectors.read(room(pose, post))[1], float(time))
     return glances
@@ -90,13 +90,47 @@ def test_where_no_scan_has_looked_nothing_is_known_beyond_the_rim() -> None:
 def test_scans_are_forgotten_in_time_and_where_odometry_jumps() -> None:
     glances = looked((0.0, 0.0, math.pi), (0.0, 0.0, 0.0))
     assert far(glances, math.pi)[12] > 0.5
-    sectors = Sectors(a_card())
+    sectors = Sectors(a_card(), mount=SCOUT.lidar_mount)
     for time in np.arange(2.0, 6.0, 0.5).tolist():
         assert (far(glances, math.pi)[12] > 0.5) == (time <= 4.5)
         glances.add(np.zeros(3), sectors.read(room((0.0, 0.0, 0.0)))[1], time)
     glances = looked((0.0, 0.0, math.pi), (0.0, 0.0, 0.0))
     glances.add(np.array((0.3, 0.0, 0.0)), sectors.read(room((0.3, 0.0, 0.0)))[1], 1.1)
     assert far(glances, math.pi)[12] == 0.0
+
+
+def test_what_an_earlier_scan_looked_through_stays_where_the_newest_hits_it() -> None:
+    # Somebody came from behind since the first scan, and stands at the side of the second.
+    card, sectors = a_card(), Sectors(a_card(), mount=SCOUT.lidar_mount)
+    glances = Glances(card, SCOUT, moves=False)
+    glances.add(np.array((0.0, 0.0, math.pi)), sectors.read(room((0.0, 0.0, math.pi)))[1], 0.0)
+    newest = (0.0, 0.0, 1.6)
+    glances.add(np.array(newest), sectors.read(room(newest, post=0.05))[1], 1.0)
+    found = far(glances, math.pi)
+    assert found[11:13].max() < 0.4 and found[[3, 20]].min() > 0.8
+
+
+@pytest.mark.parametrize("rays", [97, 181, 241, 343, 721])
+def test_a_direction_in_which_a_ray_has_hit_is_free_no_farther_than_that(rays: int) -> None:
+    angles = np.radians(np.linspace(-120.0, 120.0, rays))
+    for ray in range(2, rays - 2):
+        hit = np.full(rays, 1.4)
+        hit[ray] = 0.5
+        nearest = nearest_hits(angles, hit)
+        direction = int((angles[ray] / math.tau + 0.5) * len(nearest))
+        assert nearest[direction] <= 0.5
+        assert nearest.max() == 1.4
+
+
+def test_a_lidar_with_a_roll_and_short_rays_is_read() -> None:
+    rolled = replace(SCOUT, lidar_mount=(0.08, 0.0, 0.0, math.pi))
+    glances = Glances(a_card(rolled), SCOUT, moves=False)
+    far_away = Points(np.radians(np.arange(-120.0, 120.0)), np.full(240, 9.0), (0.08, 0.0), 1.0)
+    glances.add(np.zeros(3), far_away, 0.0)
+    states = np.zeros((1, 5))
+    closeness = glances.closeness(states, np.ones(24, np.bool_))
+    # It has looked a meter far, and nowhere behind.
+    assert (closeness >= 0.99 * SCOUT.lidar_to_rim).all() and closeness.min() < 0.15
 
 
 @pytest.mark.parametrize(("approach", "drives"), [(0.0, True), (1e-3, False)])

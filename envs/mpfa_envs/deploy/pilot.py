@@ -318,8 +318,8 @@ class Pilot:
         scan_pose: tuple[float, float, float] | None,
         time: float | None,
         age: float,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
-        """Observations that the filter allows for, ``[S, O]``; their states; the turn till then."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+        """Observations that the filter allows for, ``[S, O]``; their states; turns till then."""
         if self.goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
@@ -344,7 +344,7 @@ class Pilot:
         rows = observations_from(ahead, ranges, points, taken, self.card, self._observation, *facts)
         self._observation[0] = rows[0]
         self._ground.is_new = False
-        return rows, ahead, float(ahead[0, 2] - taken[2])
+        return rows, ahead, ahead[:, 2] - taken[2]
 
     def give(self, time: float, linear: float, angular: float) -> None:
         """Remember what was ordered, where that is not what the pilot has decided.
@@ -387,8 +387,8 @@ class Pilot:
         if not self.arrived(pose) and self._arrival.turns:
             self._time = self._time + self.period if time is None else check_number("time", time)
             return self._command(0.0, self._arrival.turn(pose[2], speeds[0]))
-        rows, ahead, turn = self._observe(scan, pose, speeds, scan_pose, time, age)
-        blind, hidden = self.sectors.blind(scan, turn)
+        rows, ahead, turns = self._observe(scan, pose, speeds, scan_pose, time, age)
+        blind, hidden = self.sectors.blind(scan, turns)
         learned, goal = self.card.robot, self._ground.goal or pose[:2]
         slower = self._arrival.fastest(pose, goal)
         # Whatever the policy reads in them, what was not seen begins at the rim.
@@ -405,7 +405,7 @@ class Pilot:
         if backwards or (np.abs(towards) < _TOWARDS).any():
             left, right = on_the_spot(self.robot, learned, left, right)
         if self._keep is not None:
-            reject_blind_front(blind + turn)
+            reject_blind_front(blind + turns[0])
             # Wheels that brake all the time stand a time step later than those that do so in steps.
             old = self.pace * (scan_age + self.latency + OFF) + self._keep.body.time_step
             seen = states, self._still, hidden

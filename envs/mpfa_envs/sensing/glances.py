@@ -24,7 +24,8 @@ _APART: Final = 0.1, math.radians(15.0)
 _OLD: Final = 4.0
 """Time for which they are kept [s]."""
 _FAR: Final = 1.5
-"""Distance beyond which a scan is not looked at, as odometry drifts [m]."""
+"""Distance of a place from where a scan was taken beyond which that does not count, and of that
+from the robot [m]: rays are farther apart there, and odometry drifts."""
 _LATER: Final = 0.05
 """Time by which a scan may be newer than the last one, over that between their decisions [s]."""
 _DIRECTIONS: Final = 240
@@ -52,9 +53,11 @@ class Glances:
         self._last, self._time = np.full(3, math.nan), 0.0
         self._times, self._places = np.zeros(0), np.zeros((0, 3))
         self._ranges = np.zeros((0, _DIRECTIONS))
-        width = math.radians(card.field_of_view) / card.sectors
-        middles = 0.5 * math.radians(card.field_of_view) - width * (np.arange(card.sectors) + 0.5)
-        self._rays = middles[:, None] + width * np.linspace(-0.5, 0.5, _RAYS)
+        self._hits: list[NDArray[np.float64]] = []
+        self._view = math.radians(card.field_of_view)
+        self._width = self._view / card.sectors
+        middles = 0.5 * self._view - self._width * (np.arange(card.sectors) + 0.5)
+        self._rays = middles[:, None] + self._width * np.linspace(-0.5, 0.5, _RAYS)
 
     def begin(self) -> None:
         """Forget all scans."""
@@ -76,31 +79,30 @@ class Glances:
         if away > robot.max_wheel_speed * passed or turned > robot.max_angular_speed * passed:
             self.begin()
         self._last, self._time = taken.copy(), time
-        place, kept = lidar_pose(taken, *points.sensor), time - self._times <= _OLD
-        if len(self._times) > 1:
-            away, turned = _between(self._places[-2], place)
+        place = lidar_pose(taken, *points.sensor)
+        kept = (time - self._times >= 0.0) & (time - self._times <= _OLD)
+        if len(kept) > 1:
+            # The last one may have been kept as the newest alone.
+            away, turned = _between(self._places[-2], self._places[-1])
             kept[-1] &= away >= _APART[0] or turned >= _APART[1]
         kept[: -_KEPT + 1] = False
         self._keep(kept)
+        met = points.ranges < min(self._card.max_range, points.reach)
         x = points.ranges * np.cos(points.angles) - points.sensor[0]
         y = points.ranges * np.sin(points.angles) - points.sensor[1]
-        angles, ranges = np.arctan2(y, x), np.hypot(x, y)
-        # So few directions that each has a ray, and what lies between two is hidden by one.
-        count = min(_DIRECTIONS, max(int(0.7 * len(angles)), 1))
-        bins = (np.floor((angles / math.tau + 0.5) * count).astype(np.int64)) % count
-        nearest = np.full(count, math.inf)
-        np.minimum.at(nearest, bins, ranges)
-        empty = np.isinf(nearest)
-        nearest[empty | np.roll(empty, 1) | np.roll(empty, -1)] = 0.0
-        row = nearest[np.arange(_DIRECTIONS) * count // _DIRECTIONS]
+        angles, ranges = np.arctan2(y, x), np.minimum(np.hypot(x, y), points.reach)
         self._times = np.append(self._times, time)
         self._places = np.concatenate((self._places, place[None]))
-        self._ranges = np.concatenate((self._ranges, row[None]))
+        self._ranges = np.concatenate((self._ranges, nearest_hits(angles, ranges)[None]))
+        cosine, sine = math.cos(place[2]), math.sin(place[2])
+        hits = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1) + place[:2]
+        self._hits.append(hits[met])
 
     def _keep(self, kept: NDArray[np.bool_]) -> None:
         """Forget all scans but some."""
         self._times, self._places = self._times[kept], self._places[kept]
         self._ranges = self._ranges[kept]
+        self._hits = [hits for hits, stays in zip(self._hits, kept, strict=True) if stays]
 
     def closeness(
         self, states: NDArray[np.float64], hidden: NDArray[np.bool_]
@@ -111,16 +113,47 @@ class Glances:
             states: Poses (x, y, heading, ...) at which they are hidden [m, m, rad], ``[S, 5]``.
             hidden: True for these sectors, ``[sectors]``.
         """
-        rays = self._rays[hidden]
-        mount_x, mount_y, _ = self._card.robot.lidar_mount
-        far = np.empty((len(states), len(rays)))
+        far = np.zeros((len(states), np.count_nonzero(hidden)))
+        if far.size and self._hits:
+            mount_x, mount_y = self._card.robot.lidar_mount[:2]
+            hits = np.concatenate(self._hits)
+            for state, row in zip(states, far, strict=True):
+                away = np.hypot(*(self._places[:, :2] - state[:2]).T) <= _FAR
+                place, rim = lidar_pose(state, mount_x, mount_y), self._robot.radius
+                earlier = self._places[away], self._ranges[away]
+                look_back(place, (mount_x, mount_y), self._rays[hidden], rim, *earlier, row)
+                np.minimum(row, self._nearest(place, hits)[hidden], out=row)
         near = self._card.closeness_distance
-        for state, row in zip(states, far, strict=True):
-            away = np.hypot(*(self._places[:, :2] - state[:2]).T) <= _FAR
-            place = lidar_pose(state, mount_x, mount_y)
-            earlier = self._places[away], self._ranges[away]
-            look_back(place, (mount_x, mount_y), rays, self._robot.radius, *earlier, row)
         return np.where(far > 0.0, near / np.maximum(far, near), 1.0)
+
+    def _nearest(
+        self, lidar: NDArray[np.float64], hits: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Distance of the nearest hit in each sector [m], ``[sectors]``; infinite without."""
+        across, up = (hits - lidar[:2]).T
+        angles = (np.arctan2(up, across) - lidar[2] + math.pi) % math.tau - math.pi
+        sectors = np.floor((0.5 * self._view - angles) / self._width).astype(np.int64)
+        within = (sectors >= 0) & (sectors < self._card.sectors)
+        nearest = np.full(self._card.sectors, math.inf)
+        np.minimum.at(nearest, sectors[within], np.hypot(across, up)[within])
+        return nearest
+
+
+def nearest_hits(angles: NDArray[np.float64], ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance up to which nothing was hit around each direction [m]; 0 where no ray looks."""
+    # So few directions that each has a ray, and what lies between two is hidden by one.
+    count = min(_DIRECTIONS, max(int(0.7 * len(angles)), 1))
+    turns = (angles / math.tau + 0.5) * count
+    nearest = np.full(count, math.inf)
+    for off in (-1e-6, 1e-6):  # On the border of two it is in both.
+        bins = np.floor(turns + off).astype(np.int64) % count
+        np.minimum.at(nearest, bins, ranges)
+    empty = np.isinf(nearest)
+    nearest[empty | np.roll(empty, 1) | np.roll(empty, -1)] = 0.0
+    # One of all directions may lie in two of these.
+    number = np.arange(_DIRECTIONS)
+    first, last = number * count // _DIRECTIONS, ((number + 1) * count - 1) // _DIRECTIONS
+    return np.minimum(np.minimum(nearest[first], nearest[last]), _FAR)
 
 
 def _between(first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:

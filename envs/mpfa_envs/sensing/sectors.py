@@ -27,6 +27,8 @@ _NEAR = 0.08
 """Returns up to this beyond the least valid range may be too near for the next scan [m]."""
 _AROUND = np.radians(np.arange(-177.5, 180.0, 5.0))
 """Directions in which a scan is asked for rays [rad]."""
+_HIDDEN = math.radians(2.5)
+"""Angle at a side of a sector that may be hidden while the sector counts as seen [rad]."""
 _INSIDE = 0.03
 """Rays that end so far within the robot's radius are not noise of an obstacle at its rim [m]."""
 _SUDDEN = 0.8
@@ -203,24 +205,26 @@ class Sectors:
         ray = int(measured[depths.argmax()])
         return float(scan.angle_min + ray * scan.angle_increment), float(depths.max())
 
-    def blind(self, scan: Scan, turn: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def blind(
+        self, scan: Scan, turns: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Find the directions in which a scan does not look, ``unseen`` notwithstanding.
 
         Args:
             scan: What the lidar has measured.
-            turn: Turn of the robot since [rad].
+            turns: Turns of the robot since, in each of the states it may be in [rad], ``[S]``.
 
         Returns:
-            Directions in the robot's frame, 5 degrees apart [rad], ``[D]``; and for each sector
-            whether one of them is in it, ``[sectors]``.
+            Directions in the robot's frame after the first turn, 5 degrees apart [rad], ``[D]``;
+            and the sectors that are hidden after one of them, ``[sectors]``.
         """
         rays = self._measured(scan)[0]
         half = 0.5 * rays.step * rays.valid.size + _EDGE
-        directions = _AROUND[np.abs(_wrapped(_AROUND + turn - rays.middle)) > half]
-        missed = _AROUND[~rays.cover(_AROUND + turn) & (np.abs(_AROUND) <= self._edge)]
-        hidden = np.zeros(self.card.sectors, dtype=np.bool_)
-        hidden[self._index(missed)] = True
-        return directions, hidden
+        directions = _AROUND[np.abs(_wrapped(_AROUND + turns[0] - rays.middle)) > half]
+        inner = max(0.5 * self._width - _HIDDEN, 0.0)
+        asked = self._middles[:, None] + np.array([-inner, 0.0, inner])
+        covered = rays.cover(asked + turns[:, None, None])
+        return directions, np.asarray(~covered.all(axis=(0, 2)))
 
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
         """Number of the sector of each angle in view."""
