@@ -335,7 +335,7 @@ def test_what_lies_beyond_the_last_ray_is_not_seen(x: float, view: int, silent: 
     scan = seen_by(robot, (0.0, -1.3, 0.4))
     sectors = Sectors(facts, mount=robot.lidar_mount, unseen=0.3, silent=silent)
     ranges, _ = sectors.read(scan)
-    _, hidden = sectors.blind(scan, np.zeros(1))
+    _, hidden = sectors.blind(scan)
     rear = ranges[[0, 1, 2, -3, -2, -1]]
     assert rear.tolist() == [0.3] * 6
     assert hidden[[0, 1, 2, -3, -2, -1]].all()
@@ -359,7 +359,7 @@ def test_what_a_lidar_that_turns_right_does_not_see_is_what_one_that_turns_left_
     for scan in (leftward, rightward):
         sectors = Sectors(facts, mount=robot.lidar_mount, unseen=0.3)
         ranges, _ = sectors.read(scan)
-        blind, hidden = sectors.blind(scan, np.zeros(1))
+        blind, hidden = sectors.blind(scan)
         found.append((ranges, np.sort(blind), hidden))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)

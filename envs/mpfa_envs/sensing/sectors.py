@@ -13,6 +13,8 @@ from mpfa_envs.sensing.observation import lidar_pose, look_from, observe_all
 from mpfa_envs.sensing.scan import Scan, ScanError, in_numbers
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from mpfa_envs.deploy.card import Card
@@ -206,7 +208,7 @@ class Sectors:
         return float(scan.angle_min + ray * scan.angle_increment), float(depths.max())
 
     def blind(
-        self, scan: Scan, turns: NDArray[np.float64]
+        self, scan: Scan, turns: Sequence[float] | NDArray[np.float64] = (0.0,)
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Find the directions in which a scan does not look, ``unseen`` notwithstanding.
 
@@ -223,7 +225,7 @@ class Sectors:
         directions = _AROUND[np.abs(_wrapped(_AROUND + turns[0] - rays.middle)) > half]
         inner = max(0.5 * self._width - _HIDDEN, 0.0)
         asked = self._middles[:, None] + np.array([-inner, 0.0, inner])
-        covered = rays.cover(asked + turns[:, None, None])
+        covered = rays.cover(asked + np.asarray(turns)[:, None, None])
         return directions, np.asarray(~covered.all(axis=(0, 2)))
 
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
