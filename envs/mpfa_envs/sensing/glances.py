@@ -49,7 +49,9 @@ class Glances:
     """
 
     def __init__(self, card: Card, robot: RobotModel, *, moves: bool) -> None:
-        self._card, self._robot, self._moves = card, robot, moves
+        self._card, self._robot = card, robot
+        # A lidar that looks all round looks so after each turn.
+        self._keeps = card.field_of_view < 360.0 and not moves
         self._last, self._time = np.full(3, math.nan), 0.0
         self._times, self._places = np.zeros(0), np.zeros((0, 3))
         self._ranges = np.zeros((0, _DIRECTIONS))
@@ -71,7 +73,7 @@ class Glances:
             points: What it met.
             time: When a decision is made by it [s].
         """
-        if self._moves:
+        if not self._keeps:
             return
         robot, passed = self._robot, max(time - self._time, 0.0) + _LATER
         away, turned = _between(self._last, taken)
