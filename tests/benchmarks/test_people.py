@@ -50,11 +50,12 @@ def test_the_table_of_walkers_that_aim_is_that_of_the_rows() -> None:
         assert share == f"{100 * driven:.0f} %"
 
 
-def test_the_table_of_tasks_is_that_of_the_rows() -> None:
-    rows, found = kept(), table("place")
+@pytest.mark.parametrize(("title", "late"), [("place", "0.0"), ("place, 0.3 s late", "0.3")])
+def test_the_table_of_tasks_is_that_of_the_rows(title: str, late: str) -> None:
+    rows, found = kept(), table(title)
     assert len(found) > 10
     for place, driver, approach, plan, *numbers in found:
-        key = place, driver, str(float(approach)), "0.0", plan, "20"
+        key = place, driver, str(float(approach)), late, plan, "20"
         names = "arrived", "touched driving", "touched standing", "time up", "time [s]"
         assert numbers == [rows[key][name] for name in names], key
 
