@@ -133,6 +133,8 @@ class Glances:
     ) -> NDArray[np.float64]:
         """Distance of the nearest hit in each sector [m], ``[sectors]``; infinite without."""
         across, up = (hits - lidar[:2]).T
+        near = across * across + up * up <= _FAR * _FAR
+        across, up = across[near], up[near]
         angles = (np.arctan2(up, across) - lidar[2] + math.pi) % math.tau - math.pi
         sectors = np.floor((0.5 * self._view - angles) / self._width).astype(np.int64)
         within = (sectors >= 0) & (sectors < self._card.sectors)
