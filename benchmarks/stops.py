@@ -37,8 +37,9 @@ from torchrl_mpfa import SignalReplayBuffer
 from torchrl_mpfa.saving import load_safely
 from training import figures, files
 from training.records import read_table, write_table
-from training.run import checkpoints, loop, script, tracking
-from training.run.loop import Schedule, TrainingRun
+from training.run import script, tracking
+from training.run.loop import TrainingRun
+from training.run.schedule import Schedule
 
 ROWS = Path(__file__).parents[1] / "docs/results/stops.csv"
 SETTINGS = [
@@ -90,8 +91,7 @@ def watch(seen: memoryview, pipe: int) -> None:
     in_phase("write", SignalReplayBuffer, "extend")
     in_phase("update", TrainingRun, "_update")
     in_phase("evaluation", TrainingRun, "_evaluate")
-    in_phase("checkpoint", checkpoints, "save")
-    in_phase("checkpoint", loop, "save")
+    in_phase("checkpoint", TrainingRun, "save")
     in_phase("pictures", tracking, "show_policy")
     in_phase("charts", figures, "plot_learning_curve")
     in_phase("charts", charts, "plot_histograms")

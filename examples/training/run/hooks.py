@@ -72,6 +72,19 @@ class Hook:
         """Release what the hook holds, however the run ended."""
 
 
+class Checkpoints(Hook):
+    """Saves the run every ``checkpoint_every`` actions and at its end."""
+
+    def on_iteration(self, run: TrainingRun) -> None:
+        """Save if it is due."""
+        if run.crossed(run.settings.checkpoint_every):
+            run.save()
+
+    def on_end(self, run: TrainingRun) -> None:
+        """Save."""
+        run.save()
+
+
 class Progress(Hook):
     """Shows the progress of a run, and writes ``status.json`` in its folder.
 

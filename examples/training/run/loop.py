@@ -1,11 +1,11 @@
-"""The training run: iterations of many robots at once, and its progress in its curriculum."""
+"""One life of a run: set up, iterate (collect, update, evaluate), save, load, close."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,113 +16,32 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import GoalRelabeling
+from mpfa_envs import GoalRelabeling, save_policy
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import Stop, run_updates
 from torchrl_mpfa.methods import OwnSignals, make_replay
 from torchrl_mpfa.methods.assembly import learned_signals
 from torchrl_mpfa.methods.her import HindsightGoals
+from torchrl_mpfa.saving import save_atomically
 from torchrl_mpfa.selection import SampledBatch
+from training import files
 from training.environments import vector_of
 from training.evaluating import Drives
-from training.files import no_room
-from training.records import EpisodeRecord, EvaluationRecord
+from training.records import EpisodeRecord, EvaluationRecord, as_table, write_table
 from training.run import tracking
 from training.run.assembly import is_compiled, make_learner, method_of
-from training.run.checkpoints import (
-    Checkpoints,
-    is_sound,
-    restore,
-    save,
-    set_random_state,
-)
+from training.run.checkpoints import FORMAT, is_sound, random_state, set_random_state
 from training.run.driving import Robots
-from training.run.evaluations import evaluate_policy
+from training.run.evaluations import evaluate_policy, kept_policy
 from training.run.exploration import make_explorer
-from training.run.hooks import Hook, Progress
+from training.run.hooks import Checkpoints, Hook, Progress
+from training.run.schedule import Schedule
 from training.run.updates import UpdateLog
 from training.settings.learners import is_discrete
-from training.settings.train import Stage, TrainSettings
+from training.settings.train import TrainSettings
 
 _MANY_EPISODES = 500
 """From here on the learning rates fall linearly unless the settings say otherwise."""
-
-
-class Schedule:
-    """Counts the actions and the episodes of a run, and knows in which stage it is.
-
-    Args:
-        stages: The stages, all of which count episodes or all of which count actions.
-
-    Examples:
-        >>> schedule = Schedule([Stage("A", episodes=1), Stage("B", episodes=3)])
-        >>> schedule.count(actions=16, episodes=1)
-        >>> schedule.advance()
-        True
-        >>> schedule.world, schedule.fraction, schedule.finished
-        ('B', 0.25, False)
-    """
-
-    def __init__(self, stages: Sequence[Stage]) -> None:
-        self.stages = list(stages)
-        self.unit = "episode" if self.stages[0].episodes else "action"
-        self.total = sum(stage.length for stage in self.stages)
-        """Episodes or actions of all stages."""
-        self.stage = 0
-        """Number of the present stage."""
-        self.actions = 0
-        self.episodes = 0
-        self._in_stage = 0
-
-    @property
-    def world(self) -> str:
-        """World of the present stage."""
-        return self.stages[self.stage].world
-
-    @property
-    def done(self) -> int:
-        """Episodes or actions that count so far."""
-        before = sum(stage.length for stage in self.stages[: self.stage])
-        return min(before + self._in_stage, self.total)
-
-    @property
-    def fraction(self) -> float:
-        """Share of the run that is done, from 0 to 1."""
-        return self.done / self.total
-
-    @property
-    def finished(self) -> bool:
-        """True if all stages are over."""
-        return self.done == self.total
-
-    def count(self, *, actions: int, episodes: int) -> None:
-        """Count what an iteration brought."""
-        self.actions += actions
-        self.episodes += episodes
-        self._in_stage += episodes if self.unit == "episode" else actions
-
-    def advance(self) -> bool:
-        """Go to the next stage if the present one is over and not the last."""
-        is_last = self.stage == len(self.stages) - 1
-        if is_last or self._in_stage < self.stages[self.stage].length:
-            return False
-        # What ended beyond the stage's length, of several robots, is not carried over.
-        self.stage, self._in_stage = self.stage + 1, 0
-        return True
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the progress of the run."""
-        return {
-            "stage": self.stage,
-            "in_stage": self._in_stage,
-            "actions": self.actions,
-            "episodes": self.episodes,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the progress of a run, which may have more stages now."""
-        self.stage, self._in_stage = state["stage"], state["in_stage"]
-        self.actions, self.episodes = state["actions"], state["episodes"]
 
 
 class TrainingRun:
@@ -178,8 +97,7 @@ class TrainingRun:
         if state is None:
             self._begin_stage()
         else:
-            restore(self, state)
-            self._resume(state["robots"], state["random"])
+            self._load(state)
         self._before = self.actions
         """Actions before the last iteration."""
         run_id = None if state is None else state["wandb"]
@@ -223,7 +141,7 @@ class TrainingRun:
         torch.manual_seed(seed)
         self.robots.begin(self.schedule.world, self.explorer, seed=seed)
 
-    # Iterations ------------------------------------------------------------------------------
+    # Iterate: collect, update, evaluate --------------------------------------------------------
 
     @property
     def actions(self) -> int:
@@ -247,8 +165,8 @@ class TrainingRun:
                     self._iterate()
                     self._call(("on_iteration",))
             except Exception as error:
-                if is_sound(self.learner) and no_room(error) is None:
-                    save(self)
+                if is_sound(self.learner) and files.no_room(error) is None:
+                    self.save()
                 raise
         self._call(("on_end",))
         return self.schedule.finished
@@ -262,17 +180,9 @@ class TrainingRun:
     def _iterate(self) -> None:
         """One action of each robot, and the updates for them."""
         self._before, self._events = self.actions, []
-        rows, records = self.robots.drive(
-            self.explorer,
-            actions=self._before,
-            episode=self.schedule.episodes,
-            entries=self.entries,
-        )
-        self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
-        self.records += records
-        self.schedule.count(actions=len(rows), episodes=len(records))
+        records = self._collect()
         if len(self.buffer) >= (self.buffer.batch_size or 0):
-            self.waiting += len(rows)
+            self.waiting += self.settings.robots
             self._update()
         if self.crossed(self.settings.tracking.log_every):
             self.log.add(self.actions, episode=self.schedule.episodes, buffer=self.buffer)
@@ -289,15 +199,20 @@ class TrainingRun:
         self._advance()
         self._anneal()
 
-    def _advance(self) -> bool:
-        """Begin the next stage if it is due; return True if it was."""
-        if not self.schedule.advance():
-            return False
-        if not self.settings.curriculum.carry:
-            self._build()
-            self.waiting = 0
-        self._begin_stage()
-        return True
+    # Collect, update, evaluate -------------------------------------------------------------------
+
+    def _collect(self) -> list[EpisodeRecord]:
+        """One action of each robot, to the buffer; return the episodes that ended."""
+        rows, records = self.robots.drive(
+            self.explorer,
+            actions=self._before,
+            episode=self.schedule.episodes,
+            entries=self.entries,
+        )
+        self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
+        self.records += records
+        self.schedule.count(actions=len(rows), episodes=len(records))
+        return records
 
     def _update(self) -> None:
         """The updates that are due, of a block of actions together."""
@@ -355,6 +270,18 @@ class TrainingRun:
         self.evaluations.append(found)
         self._events.append(("on_evaluation", found))
 
+    # The next stage ------------------------------------------------------------------------------
+
+    def _advance(self) -> bool:
+        """Begin the next stage if it is due; return True if it was."""
+        if not self.schedule.advance():
+            return False
+        if not self.settings.curriculum.carry:
+            self._build()
+            self.waiting = 0
+        self._begin_stage()
+        return True
+
     def _anneal(self) -> None:
         """Move what changes with the run: beta of Eq. (10), fusion and learning rates."""
         settings, done = self.settings, self.schedule.fraction
@@ -364,6 +291,65 @@ class TrainingRun:
             few = self.schedule.unit == "episode" and self.schedule.total < _MANY_EPISODES
             power = 3.0 if few else 1.0
         self.learner.anneal(lowest + (1.0 - lowest) * (1.0 - done) ** power)
+
+    # Save and load -------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write checkpoint, policy and records, each of them whole or not at all."""
+        folder = self.folder
+        # A run that resumes here does not log the same entries again.
+        self.tracker.flush()
+        save_atomically(self.state_dict(), folder / files.CHECKPOINT)
+        save_policy(kept_policy(self), folder / files.POLICY, overwrite=True)
+        write_table(as_table(self.records, EpisodeRecord), folder / files.EPISODES)
+        if self.evaluations:
+            write_table(as_table(self.evaluations, EvaluationRecord), folder / files.EVALUATIONS)
+        write_table(self.log.table(), folder / files.UPDATES)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next iteration of a run depends on, and its records."""
+        return {
+            "format": FORMAT,
+            "settings": asdict(self.settings),
+            "wandb": self.tracker.run_id,
+            "schedule": self.schedule.state_dict(),
+            "updates": self.updates,
+            "waiting": self.waiting // self.settings.robots,
+            "waiting_actions": self.waiting % self.settings.robots,
+            "random": random_state(self.settings.device),
+            "robots": self.robots.state_dict(),
+            "learner": self.learner.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "explorer": self.explorer.state_dict(),
+            "curiosity": None if self.bonus is None else self.bonus.checkpoint(),
+            "signals": self.signals.state_dict(),
+            "plugin": files.digest_of(self.settings.plugin),
+            "best": None if self.best is None else dict(self.best.state_dict()),
+            "records": [asdict(record) for record in self.records],
+            "evaluations": [asdict(record) for record in self.evaluations],
+            "log": self.log.state_dict(),
+        }
+
+    def _load(self, state: dict[str, Any]) -> None:
+        """Load a state of :meth:`state_dict`."""
+        self.schedule.load_state_dict(state["schedule"])
+        self.updates = state["updates"]
+        self.waiting = state["waiting"] * self.settings.robots
+        self.waiting += state["waiting_actions"]
+        self.learner.load_state_dict(state["learner"])
+        self.buffer.load_state_dict(state["buffer"])
+        self.explorer.load_state_dict(state["explorer"])
+        if self.bonus is not None:
+            self.bonus.restore(state["curiosity"])
+        self.signals.load_state_dict(state["signals"])
+        if state["best"] is not None:
+            self.best = copy.deepcopy(self.learner.policy)
+            self.best.load_state_dict(state["best"])
+        self.records = [EpisodeRecord(**record) for record in state["records"]]
+        self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
+        self.log.load_state_dict(state["log"])
+        set_random_state(self.settings.device, state["random"])
+        self._resume(state["robots"], state["random"])
 
     def _resume(self, robots: dict[str, Any], random: Any) -> None:
         """Restore the robots, or begin the next stage if it is due."""

@@ -18,7 +18,6 @@ from torchrl.record.loggers.csv import CSVExperiment
 
 from tests.integration.tiny_runs import OVERRIDES
 from training import files
-from training.run.checkpoints import save
 from training.run.hooks import Hook
 from training.run.loggers import forget_after
 from training.run.loop import TrainingRun
@@ -134,7 +133,7 @@ def test_run_whose_disk_is_full_says_so_in_one_line_and_how_to_resume(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
 
     def train_on(run: TrainingRun) -> bool:
-        save(run)
+        run.save()
         run.records = [object()]  # type: ignore[list-item]
         full()
         return True

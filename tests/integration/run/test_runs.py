@@ -25,8 +25,8 @@ from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.finished import after_the_end
 from training.records import read_table
-from training.run import checkpoints, hooks, script
-from training.run.checkpoints import read_checkpoint, save
+from training.run import hooks, loop, script
+from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, resume, start
 from training.settings.command_line import composed, parse_overrides
@@ -74,7 +74,7 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert begin(job.path, episodes=1) == 0
     assert job.is_trained()
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, lost, full)
+        patch.setattr(loop, lost, full)
         patch.setattr(hooks, "_REPORT_EVERY", 0.0)
         with pytest.raises(OSError, match="no space"):
             go_on(job.path, STAGES.format(2))
@@ -333,7 +333,7 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
 ) -> None:
     def interrupted(run: TrainingRun) -> bool:
         if saved:
-            save(run)
+            run.save()
         run.stop.ask(signal.SIGINT)
         run.stop.ask(signal.SIGINT)
         raise AssertionError("the second signal stops at once")

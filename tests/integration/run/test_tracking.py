@@ -17,7 +17,6 @@ import evaluate
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run.checkpoints import save
 from training.run.loggers import WandbLog
 from training.run.loop import TrainingRun
 from training.run.tracking import Tracker, show_policy
@@ -111,7 +110,7 @@ def killed_and_resumed(
 
     def look(run: TrainingRun) -> None:
         if run.actions == saved:
-            save(run)
+            run.save()
         if run.actions == killed:
             run.close()
             raise Killed
