@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = ["howto/signal.md", "howto/torchrl_script.md", "howto/train.md"]
+PAGES = ["howto/signal.md", "howto/task.md", "howto/torchrl_script.md", "howto/train.md"]
 FILE = re.compile(r"^```python\n# (\w+\.py)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^    (?:\.venv/bin/)?(python [^#\n]*)", re.MULTILINE)
 SHORT = (

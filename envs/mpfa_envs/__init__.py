@@ -43,6 +43,11 @@ if TYPE_CHECKING:
     from mpfa_envs.sensing.mirror import Mirror as Mirror
     from mpfa_envs.sensing.mirror import RandomMirror as RandomMirror
     from mpfa_envs.sensing.observation import OBSERVATION as OBSERVATION
+    from mpfa_envs.sensing.sensors import SENSORS as SENSORS
+    from mpfa_envs.sensing.sensors import LidarSensor as LidarSensor
+    from mpfa_envs.sensing.sensors import Sensor as Sensor
+    from mpfa_envs.sensing.sensors import Sight as Sight
+    from mpfa_envs.tasks.reward import REWARDS as REWARDS
     from mpfa_envs.tasks.reward import RewardTerms as RewardTerms
     from mpfa_envs.tasks.reward import StepOutcome as StepOutcome
     from mpfa_envs.tasks.reward import navigation_reward as navigation_reward
@@ -85,7 +90,8 @@ _NAMES = {
     "sensing.lidar": "Lidar",
     "sensing.mirror": "Mirror RandomMirror",
     "sensing.observation": "OBSERVATION",
-    "tasks.reward": "RewardTerms StepOutcome navigation_reward",
+    "sensing.sensors": "SENSORS LidarSensor Sensor Sight",
+    "tasks.reward": "REWARDS RewardTerms StepOutcome navigation_reward",
     "tasks.sampling": "WorldTask world_tasks",
     "worlds.builtin": "WORLDS",
     "worlds.shapes": "Box Cylinder Polygon",

@@ -44,6 +44,8 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         for name in ("plan", "goal_radius")
         if (value := getattr(settings, name)) != getattr(TaskConfig, name)
     }
+    if settings.sensors:
+        given["sensors"] = list(settings.sensors)
     return {
         "robot": robot,
         **{name: getattr(settings, name) for name in _OF_THE_ROBOT},
@@ -69,7 +71,7 @@ def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         **{name: getattr(settings, name) for name in _OF_THE_TASK},
         "noise": asdict(settings.noise),
         **env_arguments(settings),
-        **({"reward": _costly_reward(settings)} if settings.step_cost else {}),
+        "reward": _reward(settings),
     }
 
 
@@ -81,9 +83,11 @@ def episode_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     }
 
 
-def _costly_reward(settings: EnvironmentSettings) -> RewardFunction:
-    """Eq. (25) with a cost of time."""
+def _reward(settings: EnvironmentSettings) -> RewardFunction | str | None:
+    """The reward of a name, or Eq. (25), perhaps with a cost of time."""
     scale, cost = settings.progress_scale, settings.step_cost
+    if settings.reward is not None or not cost:
+        return settings.reward
     return partial(navigation_reward, progress_scale=scale, step_cost=cost)
 
 

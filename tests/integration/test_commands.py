@@ -33,6 +33,7 @@ from benchmarks.late import __main__ as late
 from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, worlds
 from benchmarks.values import __main__ as values
+from mpfa_envs import REWARDS, SENSORS, LidarSensor, navigation_reward
 from torchrl_mpfa.methods import METHODS, Scaled
 from training.plugins import with_plugin
 from training.settings.command_line import parse_overrides
@@ -144,9 +145,12 @@ def test_every_command_on_the_pages_is_understood(
     for name in ("benchmarks", "docs", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
-    # A page names a plugin, which registers a method.
+    # Pages name a plugin, which registers a method, sensors and a reward.
     Path("mine.py").write_text("")
     monkeypatch.setitem(METHODS, "mine", Scaled("mine", signals=["td_error"]))
+    for name in ("rear", "compass"):
+        monkeypatch.setitem(SENSORS, name, LidarSensor())
+    monkeypatch.setitem(REWARDS, "careful", navigation_reward)
     for name in ("mine", "reconstructions"):
         monkeypatch.setitem(sys.modules, name, None)  # Leaves with the test.
     parse = argparse.ArgumentParser.parse_args

@@ -28,7 +28,14 @@ from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
-from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, payments_of, resolve_reward
+from mpfa_envs.sensing.sensors import Sensor, resolve_sensors
+from mpfa_envs.tasks.reward import (
+    PROGRESS_SCALE,
+    RewardFunction,
+    named_reward,
+    payments_of,
+    resolve_reward,
+)
 from mpfa_envs.worlds.world import World
 
 if TYPE_CHECKING:
@@ -77,7 +84,15 @@ _MOST_LATENCY: Final = 2.0
 """Greatest latency [s]: where a robot will be later than that is hardly known."""
 _EMPTY: Final = World(name="empty")
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
-_DESCRIBED: Final = ("robot", "clearance", "contact", "reward", "progress_scale", "lidar")
+_DESCRIBED: Final = (
+    "robot",
+    "clearance",
+    "contact",
+    "reward",
+    "progress_scale",
+    "lidar",
+    "sensors",
+)
 """Fields that a description has in another form."""
 _MOST_RAYS: Final = 3
 """Rays of a sector in training; the nearest of more differs little, and each takes time."""
@@ -154,12 +169,16 @@ class TaskConfig:
     (``DistanceField``); or ``"none"``, only goal and collision count."""
     reward: RewardFunction | None = None
     """Computes the reward in place of Eq. (25), robot by robot and hence slowly, and without
-    progress_scale; ``functools.partial(navigation_reward, goal_reward=20.0)``, say, which is as
-    fast. Another function pays as it likes; with ``progress="none"`` it gets the straight
-    distances."""
+    progress_scale: a function, or its name in :data:`~mpfa_envs.REWARDS`.
+    ``functools.partial(navigation_reward, goal_reward=20.0)``, say, is as fast. Another function
+    pays as it likes; with ``progress="none"`` it gets the straight distances."""
     lidar: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of :class:`~mpfa_envs.Lidar`, ``{"noise": 0.02}``. Unless they say so, range, rays
     and field of view are the robot's, in sectors of 10 degrees."""
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    """Sensors beside the lidar, each a further part of the observation, behind all others: a
+    :class:`~mpfa_envs.Sensor` by name, ``{"rear": LidarSensor(...)}``, or names in
+    :data:`~mpfa_envs.SENSORS`."""
     memory: Memory = "none"
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
@@ -222,6 +241,9 @@ class TaskConfig:
                 f"{self.collision_distance:g} m at its fastest, got {self.time_step}"
             )
         self._set("lidar", self._read_lidar())
+        self._set("sensors", resolve_sensors(self.sensors))
+        if isinstance(self.reward, str):
+            self._set("reward", named_reward(self.reward))
         # Building these checks the fields that they are made from.
         _ = self.reward_function, self.observation_slices
 
@@ -284,6 +306,7 @@ class TaskConfig:
             closeness_distance=self.closeness_distance,
             memory=self.memory,
             history=self.history,
+            further=sum(sensor.width for sensor in self.sensors.values()),
             time_step=self.time_step,
             action_repeat=self.action_repeat,
             clearance=clearance,
@@ -314,13 +337,21 @@ class TaskConfig:
                 "the left of its axis (lidar_mount): left and right differ"
             )
         alike = all_around and robot.reverse and robot.min_wheel_speed == -robot.max_wheel_speed
-        alike = alike and not lidar.mount[0]
+        alike = alike and not lidar.mount[0] and not self.sensors
+        further: list[int] = []
+        for name, sensor in self.sensors.items():
+            if sensor.mirrored is None:
+                raise ValueError(
+                    f"mirror must be False with the sensor {name!r}, which has no mirror image"
+                )
+            further += [len(further) + place for place in sensor.mirrored]
         return RandomMirror(
             sectors=lidar.sectors,
             memory=self.memory,
             history=self.history,
             pairs=pairs,
             front_rear=alike and pairs is None,
+            further=further,
         )
 
     def make_noise(self, robots: int) -> NoisyMotion | None:
@@ -347,12 +378,21 @@ class TaskConfig:
     def observation_slices(self) -> Mapping[str, slice]:
         """The parts of an observation by name."""
         sectors = self.make_lidar().sectors
-        return observation_slices(sectors, memory=self.memory, history=self.history)
+        parts = observation_slices(sectors, memory=self.memory, history=self.history)
+        for name, sensor in self.sensors.items():
+            if name in parts:
+                raise ValueError(f"sensors must have names of their own, got {name!r}")
+            last = max(part.stop for part in parts.values())
+            parts[name] = slice(last, last + sensor.width)
+        return parts
 
     def make_spaces(self, diagonal: float) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
         """Make the spaces of one robot's observations and actions in worlds of a diagonal [m]."""
         sectors = self.make_lidar().sectors
         low, high = observation_bounds(sectors, diagonal, memory=self.memory, history=self.history)
+        for sensor in self.sensors.values():
+            ends = np.full((2, sensor.width), np.reshape(sensor.bounds, (2, 1)), dtype=np.float32)
+            low, high = np.append(low, ends[0]), np.append(high, ends[1])
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)
 
     def describe(self) -> dict[str, Any]:
@@ -373,6 +413,8 @@ class TaskConfig:
         )
         described["latency"] = list(self.latency) if self.latency[1] > 0.0 else None
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
+        widths = {name: sensor.width for name, sensor in self.sensors.items()}
+        described["sensors"] = widths or None
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):
             described["reward"] = "navigation_reward"

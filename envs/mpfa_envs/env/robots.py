@@ -33,6 +33,7 @@ from mpfa_envs.sensing.observation import (
     look_from,
     observe_all,
 )
+from mpfa_envs.sensing.sensors import Sight, write_sensed
 from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
@@ -102,6 +103,7 @@ class RobotBatch:
         width = max(part.stop for part in config.observation_slices.values())
         self.observations = np.zeros((count, width), dtype=np.float32)
         """The last observations, ``[N, O]``."""
+        self._own = width - sum(sensor.width for sensor in config.sensors.values())
         self.drives = make_drives(config.physics, config.robot, count, time_step=config.time_step)
         """The physics."""
         self.noise = config.make_noise(count)
@@ -309,8 +311,12 @@ class RobotBatch:
             paths,
             lidar.sectors,
             self._config.history,
-            self.observations,
+            self.observations[:, : self._own],
         )
+        if sensors := self._config.sensors:
+            motions, goals = self.episodes.motions.copy(), self.episodes.goals.copy()
+            sight = Sight(motions, goals, chosen, self.worlds.arrays, rngs)
+            write_sensed(sensors, sight, self.observations[:, self._own :])
 
     def measurements(self) -> NDArray[np.float64]:
         """Return the state that hindsight relabeling needs, ``[N, 12 + rays]``.

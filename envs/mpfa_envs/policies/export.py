@@ -99,6 +99,8 @@ def export_policy(
 def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """The card of a policy as plain values, without its file."""
     config = TaskConfig(**policy.env_arguments)
+    if config.sensors:
+        raise CardError(f"a robot senses by its lidar alone, not by {', '.join(config.sensors)}")
     lidar = config.make_lidar()
     robot = config.robot
     document = {

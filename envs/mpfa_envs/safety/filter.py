@@ -50,6 +50,7 @@ class SafetyFilter:
         closeness_distance: A range of this or less has closeness one [m].
         memory: As for :class:`~mpfa_envs.NavigationEnv`.
         history: As there.
+        further: Values of further sensors in an observation, which the filter does not look at.
         time_step: As there [s].
         action_repeat: As there.
         clearance: Clearance of the rim to be kept [m]; a third of it where the robot passes by
@@ -91,6 +92,7 @@ class SafetyFilter:
         closeness_distance: float,
         memory: Memory = "none",
         history: int = 0,
+        further: int = 0,
         time_step: float = 0.1,
         action_repeat: int = 2,
         clearance: float = CLEARANCE,
@@ -101,6 +103,7 @@ class SafetyFilter:
     ) -> None:
         self.robot = resolve_robot(robot)
         self._parts = observation_slices(sectors, memory=memory, history=history)
+        self._further = check_count("further", further, least=0)
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
         self._sectors, self._rays = sectors, len(angles) // sectors
@@ -195,7 +198,7 @@ class SafetyFilter:
         Raises:
             ValueError: As when it is called.
         """
-        size = max(part.stop for part in self._parts.values())
+        size = max(part.stop for part in self._parts.values()) + self._further
         seen = np.asarray(observations, dtype=np.float64)
         wanted = np.asarray(action, dtype=np.float32)
         if seen.ndim < 2 or seen.shape[-1] != size:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -26,10 +28,11 @@ class Mirror(nn.Module):
             :class:`~mpfa_envs.DiscreteWheels`; None: actions are wheel speeds.
         front_rear: True to swap front and rear. The wheels must be as fast backwards, and the lidar
             see all around (``field_of_view=360``).
+        further: Places that the values of further sensors have in the mirror.
 
     Raises:
         ValueError: If a pair has no mirror image among them, or front and rear are to be swapped
-            with pairs or with an odd number of sectors.
+            with pairs, with an odd number of sectors or with further sensors.
 
     Examples:
         >>> mirror = Mirror()
@@ -51,11 +54,14 @@ class Mirror(nn.Module):
         history: int = 0,
         pairs: WheelPairs | None = None,
         front_rear: bool = False,
+        further: Sequence[int] = (),
     ) -> None:
         super().__init__()
         parts = observation_slices(sectors, memory=memory, history=history)
         if front_rear and pairs is not None:
             raise ValueError(f"pairs must be None with front_rear, got {pairs!r}")
+        if front_rear and len(further):
+            raise ValueError(f"further must be empty with front_rear, got {further!r}")
         if front_rear and sectors % 2:
             raise ValueError(f"sectors must be even with front_rear, got {sectors}")
         size = max(part.stop for part in parts.values())
@@ -66,7 +72,8 @@ class Mirror(nn.Module):
         if history:
             scans = order[parts["lidar_history"]].view(history, sectors)
             order[parts["lidar_history"]] = scans.flip(1).roll(shift, 1).flatten()
-        sign = torch.ones(size)
+        order = torch.cat([order, size + torch.tensor([*further], dtype=torch.long)])
+        sign = torch.ones(len(order))
         # The cosine is positive ahead, the sine to the left.
         turned = 0 if front_rear else 1
         sign[parts["goal_direction"].start + turned] = -1.0
@@ -115,6 +122,7 @@ class RandomMirror(Transform):
         history: As for :class:`Mirror`.
         pairs: As for :class:`Mirror`.
         front_rear: True to swap front and rear, too, under the conditions of :class:`Mirror`.
+        further: As for :class:`Mirror`.
         generator: Source of the choices; None: PyTorch's own.
 
     Raises:
@@ -142,12 +150,20 @@ class RandomMirror(Transform):
         history: int = 0,
         pairs: WheelPairs | None = None,
         front_rear: bool = False,
+        further: Sequence[int] = (),
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.chance = check_share("chance", chance)
         self.mirrors = [
-            Mirror(sectors=sectors, memory=memory, history=history, pairs=pairs, front_rear=each)
+            Mirror(
+                sectors=sectors,
+                memory=memory,
+                history=history,
+                pairs=pairs,
+                front_rear=each,
+                further=further,
+            )
             for each in ((False, True) if front_rear else (False,))
         ]
         self.generator = generator

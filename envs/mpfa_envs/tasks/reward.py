@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from mpfa_envs.checks import check_number
+from mpfa_envs.checks import check_number, got
 
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
@@ -113,6 +113,20 @@ def navigation_reward(
     payments = float(goal_reward), float(collision_reward), float(progress_scale), float(step_cost)
     approach = float(outcome.previous_distance - outcome.distance)
     return RewardTerms(*reward_terms(outcome.success, outcome.collision, approach, payments))
+
+
+REWARDS: Final[dict[str, RewardFunction]] = {"navigation": navigation_reward}
+"""Rewards by the names that tasks and settings may have for them."""
+
+
+def named_reward(name: str) -> RewardFunction:
+    """Find a reward by its name."""
+    if name not in REWARDS:
+        raise ValueError(
+            f"reward must be callable, None or a name in REWARDS, {sorted(REWARDS)}, "
+            f"{got(name, REWARDS)}"
+        )
+    return REWARDS[name]
 
 
 def resolve_reward(

@@ -56,6 +56,9 @@ class EnvironmentSettings:
     progress: str = TaskConfig.progress
     """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or ``none``:
     goal and collision alone."""
+    reward: str | None = None
+    """Name of a reward in :data:`mpfa_envs.REWARDS`, which a plugin registers; it takes the place
+    of Eq. 25 with ``progress_scale`` and ``step_cost``. Null: Eq. 25."""
     goal_radius: float = setting(TaskConfig.goal_radius, between(0.1, 1.5, "from 0.1 to 1.5 [m]"))
     """Distance from the goal at which the robot has arrived [m]."""
     max_goal_distance: float | None = setting(None, POSITIVE)
@@ -72,6 +75,9 @@ class EnvironmentSettings:
     """Earlier scans in the observation, which show what moves."""
     field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))
     """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own."""
+    sensors: list[str] = field(default_factory=list)
+    """Names of further sensors in :data:`mpfa_envs.SENSORS`, which a plugin registers. A policy
+    with them drives in evaluations, and no robot."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
     latency: Any = None

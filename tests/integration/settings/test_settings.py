@@ -302,7 +302,8 @@ OF_PARTS = {
 
 
 def test_every_number_and_every_word_among_the_settings_has_a_rule() -> None:
-    looked_up = {"resume", "device", "regime", "environment.robot", "evaluation.world"}
+    looked_up = {"resume", "device", "regime", "evaluation.world"}
+    looked_up |= {f"environment.{name}" for name in ("robot", "reward", "sensors")}
     free = {"method.signals", "curriculum.stages"}
     settings = TrainSettings()
     rules = {
