@@ -264,7 +264,7 @@ def _cost_of_waiting(trial: NDArray[np.float64], body: Body, effort: Effort) -> 
     """What a plan costs that begins without moving [s]."""
     # A robot that stands sees the same again: to wait for a better plan must not be free.
     fastest = max(abs(trial[0, 0]), abs(trial[0, 1]))
-    if effort.blind:  # While it turns it sees less of what is beside it, and may not drive on.
-        fastest = 0.5 * abs(trial[0, 0] + trial[0, 1])
+    if effort.blind:  # While it turns it sees less beside it; but a turn is more than to stand.
+        fastest = 0.5 * fastest + 0.25 * abs(trial[0, 0] + trial[0, 1])
     slow = 1.0 - min(fastest / body.limits.fast, 1.0)
     return effort.stand * slow * slow
