@@ -39,16 +39,15 @@ from training.comparison.report import table
 COMMIT = "a0a3ab5"
 """Commit that trained and tested every run of the kept rows."""
 _WIDTH = 120
-_CAPTION = "Mean over runs and its 95 % interval; in brackets the number of runs."
 _MARKED = f"{MARK}: [our reconstruction](../methods/README.md#all-methods) of a method of others."
 _FIGURES = {
-    3: "Fig. 3: TD error and reward per step of DDPG with PER in map A",
-    5: "Fig. 5: reward per step in map A with MPFA-PER and φ = 2, 3 and 4",
-    8: "Fig. 8: reward per step with parts of the priority",
-    9: "Fig. 9: reward per step with the raise of positive transitions",
-    10: "Fig. 10: reward per step with raise and decay",
-    11: "Fig. 11: reward per step with all parts together",
-    13: "Fig. 13: total reward of every 10,000 steps",
+    3: "TD error and reward per step of DDPG with PER in map A",
+    5: "reward per step in map A with MPFA-PER and φ = 2, 3 and 4",
+    8: "reward per step with parts of the priority",
+    9: "reward per step with the raise of positive transitions",
+    10: "reward per step with raise and decay",
+    11: "reward per step with all parts together",
+    13: "total reward of every 10,000 steps",
 }
 _QUESTION = """
 **Question.** Does MPFA-PER reach more goals than other replay methods, and in fewer training steps,
@@ -56,15 +55,13 @@ as the paper's Tables 2 to 4 say?
 """
 _WORLDS = f"""
 The paper's worlds are not published: [B to D](../worlds.md) are from the public course that it
-follows, and the unseen world is our own. So every absolute number may differ. Compare methods
-within a column. Success is that of one map with 200 pairs of start and goal, and intervals are over
-seeds alone. Training has [our additions to
-DDPG](../paper_map.md#what-the-paper-does-not-say-and-what-we-chose) and sixteen robots. PER's
-success is near the ceiling of 100 %, where differences have little room. So failures are compared
-as ratios, and success stands beside them. A name with {MARK} is [our
-reconstruction](../methods/README.md#all-methods) of a method of others. Our numbers in its rows,
-and claims with {MARK} that rest on them, say nothing about the original. Of MPFA-PER, too, gaps
-were filled.
+follows, and the unseen world is our own. So compare methods within a column. Success is that of one
+map with 200 pairs of start and goal, and intervals are over seeds alone. Training has [our
+additions to DDPG](../paper_map.md#what-the-paper-does-not-say-and-what-we-chose) and sixteen
+robots. PER's success is near the ceiling of 100 %, so failures are compared as ratios. A name with
+{MARK} is [our reconstruction](../methods/README.md#all-methods) of a method of others. Our numbers
+in its rows, and claims with {MARK}, say nothing about the original. Of MPFA-PER, too, gaps were
+filled.
 """
 _ASKED = """
 [The hypothesis, the test and the seeds](study.md#the-papers-question-again) were committed 23
@@ -75,16 +72,20 @@ That nobody looked in between is the authors' word. Runs are compared unpaired, 
 _FASTER = (
     """
 The paper says that training with MPFA-PER converges the fastest, "after 130,000 steps" of Fig. 13,
-and that it is stabler. Its text tests neither. The table has all 46 seeds of three methods, seed by
-seed, and was made after the figures had been seen: it is exploratory. A step is an action. Our runs
-have the paper's 1,000 episodes and end before its 130,000 steps.
+and that it is stabler. Its text tests neither. Our runs have the paper's 1,000 episodes and end
+before so many steps. The table has all 46 seeds, and was made after the figures had been seen: it
+is exploratory.
 """,
     """
-No difference between MPFA-PER and PER is left after correction. In the last world MPFA-PER reaches
-more goals than uniform replay, which is the only difference that is left. p are of the permutation
-test of signs, first as they are, then corrected together by Holm's method.
+After correction one difference is left: in the last world MPFA-PER reaches more goals than uniform
+replay. p are of the permutation test of signs, first as they are, then corrected together by Holm's
+method.
 """,
 )
+_PICTURES = """
+Mean over runs and its 95 % interval; in brackets the number of runs. [A
+table](#does-mpfa-per-learn-faster) compares three of the methods.
+"""
 _ERRORS = """
 In the paper's Fig. 3 the TD error of PER rises after 80 episodes, and the reward per step stays
 near 0.5. Ours has ten seeds, made after the other figures were seen. p are of the signs, and not
@@ -96,10 +97,10 @@ Numbers of this table are of the seeds of Tables 2 to 4, ten an arm. [New
 seeds](#does-mpfa-per-fail-less-often-than-per) say more of MPFA-PER, PER and uniform replay.
 """
 _STEPS = f"""
-A step is an action of 0.2 s. Times are those of runs that had the machine to themselves, one after
-another. DDPG + RAdam{MARK} trains a curiosity model as well, and KLPER{MARK} draws three batches
-for an update. In the mean these two took the longest. The machine is a virtual one, whose speed
-was seen to double within ten minutes. Smaller differences may come from that.
+A step is an action of 0.2 s. Times are those of runs that had the machine to themselves. DDPG +
+RAdam{MARK} trains a curiosity model as well, and KLPER{MARK} draws three batches for an update. In
+the mean these two took the longest. The speed of the virtual machine was seen to double within ten
+minutes. Smaller differences may come from that.
 """
 _PHI = """
 The factor φ of the raise, as in Fig. 5. These runs train for 100 episodes in world A, which has no
@@ -116,20 +117,18 @@ of five tasks have a detour here too, which the paper has not. There are sixteen
 """
 _READ = (
     """
-Each number of ours is the mean over runs with Student's 95 % interval over runs. A run is one seed.
-It has 1,000 training episodes in the worlds A to D. Then its last policy has 200 tests in an unseen
-world, on simulated wheels. A test ends with a collision at contact. A test that neither succeeds
-nor collides runs out of time, which the paper's tables do not know. The time is that of the tests
-that reached their goal.
+Each number of ours is the mean over runs with Student's 95 % interval. A run is one seed. It has
+1,000 training episodes in the worlds A to D. Then its last policy has 200 tests in an unseen world,
+on simulated wheels. A test ends with a collision at contact, and fails by that or by the time
+limit, which the paper's tables do not know. The time is that of the tests that reached their goal.
 """,
     """
-A run fails in each test that does not succeed. Ratios of failures have an interval by a bootstrap
-over seeds: 95 % percentiles of 10,000 resamples. How often it covers a ratio was not tried. Where
-interval and p disagree, nothing was found. Arms of the tables with at least six seeds in common are
-compared seed by seed, and p is that of the permutation test of signs. The test is the same for
-failures and for success. Other arms are compared by the means of all their
-runs, without a power. *Found with 80 % power* is the true difference that a t-test of as many seeds
-finds with that probability. Its level is 5 % divided by the number of comparisons.
+Ratios of failures have an interval by a bootstrap over seeds: 95 % percentiles of 10,000 resamples.
+How often it covers a ratio was not tried. Where interval and p disagree, nothing was found. Arms
+with at least six seeds in common are compared seed by seed, by the permutation test of signs. Other
+arms are compared by the means of all their runs, without a power. *Found with 80 % power* is the
+true difference that a t-test of as many seeds finds with that probability. Its level is 5 % divided
+by the number of comparisons.
 """,
     """
 [The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
@@ -140,11 +139,10 @@ the paper have five seeds in place of ten.
 )
 _MADE = f"""
 Every run was trained and tested at commit {COMMIT}, those of Fig. 3 at 19746a0f, one thread each. A
-run takes 4 to 12 minutes.
-Another kind of processor rounds differently. So its run of the same seed is another run from the
-first update on. The commands below make runs of the same settings with the code of this version.
-The first one continues where it was stopped. The second one makes the runs of Table 3's times, one
-at a time, and the third one those of Fig. 3. The last one writes this page from their rows.
+run takes 4 to 12 minutes. Another kind of processor rounds differently, and makes another run of
+the same seed. The commands make runs of the same settings with the code of this version: those of
+the tables, which continue where they were stopped, those of Table 3's times, and those of Fig. 3.
+The last one writes this page from their rows.
 """
 _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
@@ -168,10 +166,10 @@ def write_page(rows: Rows, page: Path, pictures: Path) -> list[Path]:
         raise ValueError(f"{rows.folder} has no rows: python -m benchmarks.paper run makes them")
     made = plot_figures(rows, pictures)
     pictured = [
-        f"![{title}]({Path(relpath(path, page.parent)).as_posix()})\n\n*{title}.* {_CAPTION}"
-        + f" {_MARKED}" * ("13" in path.stem)
+        f"![Fig. {number}]({Path(relpath(path, page.parent)).as_posix()})\n\n"
+        f"*Fig. {number}: {_FIGURES[number]}.*"
         for path in made
-        for title in [_FIGURES[int(path.stem.removeprefix("figure_"))]]
+        for number in [int(path.stem.removeprefix("figure_"))]
     ]
     write_text_atomically(text_of(rows, pictured) + "\n", page)
     return [page, *made]
@@ -219,7 +217,6 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_STEPS if len(rows.times) else f"{_STEPS} No run is timed yet."),
             "## Table 4: other methods in the unseen world",
             unseen_table(found, TABLE_4),
-            _MARKED,
             "## Neighbors in the paper's order: the planned comparisons",
             comparison_table(found, planned, paper),
             "## Other comparisons, exploratory",
@@ -234,7 +231,7 @@ def text_of(rows: Rows, pictured: Sequence[str]) -> str:
             _filled(_ROBOTS),
             arms_table(found, OTHER_ARMS["robots"]),
             "## Figures",
-            "[A table](#does-mpfa-per-learn-faster) compares the training of three of the methods.",
+            _filled(_PICTURES),
             *pictured,
             *filter(
                 None, [errors_table(rows.folder) and _filled(_ERRORS), errors_table(rows.folder)]
