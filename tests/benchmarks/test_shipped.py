@@ -67,7 +67,7 @@ def test_time_over_control_on_slower_robots_is_that_of_the_page(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     drivers.main([str(shipped.DRIVERS)])
-    times = capsys.readouterr().out.strip().split("\n\n")[2].splitlines()
+    times = capsys.readouterr().out.strip().split("\n\n")[1].splitlines()
     found = {}
     for line in times[2:]:
         cells = [cell.strip() for cell in line.split("|")]
