@@ -40,6 +40,27 @@ def test_a_policy_that_stands_twice_at_a_place_is_led_some_meters_and_no_farther
     assert lazy.count == 2
 
 
+def test_a_policy_that_comes_back_to_stand_again_is_led_twice_as_far() -> None:
+    lazy, led = Rescued(stand), 0
+    env = VectorNavigationEnv(1, world=HALL, **TASK)
+    env.reset(seed=0, options={"tasks": [TASKS[0].task]})
+    lazy.begin(0, env.errand(0))
+    lengths: list[float] = []
+    for _ in range(900):
+        senses = env.senses(np.array([0]))
+        # As of a robot that stands at one place whenever nobody leads it.
+        back = senses.motions.copy()
+        back[:, 0] = -5.0 + (0.14 * (led % 8) if lazy.leads(0) else 0.0)
+        lazy.drive(senses._replace(motions=back))
+        if lazy.leads(0):
+            led += 1
+        elif led:
+            lengths.append(led)
+            led = 0
+    assert lazy.count >= 3
+    assert lengths[1] == pytest.approx(2 * lengths[0], rel=0.2)
+
+
 def test_a_policy_that_drives_is_left_alone() -> None:
     def ahead(observations: np.ndarray) -> np.ndarray:
         return np.ones((len(observations), 2), np.float32)

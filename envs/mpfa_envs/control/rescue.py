@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _SAME: Final = 1.0
 """Distance within which two places where a robot stood are the same [m]."""
 _LED: Final = 4.0
-"""Length of the path on which the planner leads it away [m]."""
+"""Length of the path on which the planner leads it away, doubled each time [m]."""
 
 
 @dataclass
@@ -29,6 +29,7 @@ class _Drive:
     places: list[list[float]] = field(default_factory=list)  # since it stood last [m]
     stood: list[list[float]] = field(default_factory=list)  # where it did [m]
     left: float = 0.0  # of the path on which the planner leads it [m]
+    next: float = _LED  # length of the next such path [m]
 
 
 class Rescued:
@@ -36,7 +37,8 @@ class Rescued:
 
     A robot that has not left a square of 0.1 m for ten seconds stands still. If that is within a
     meter of where it stood before, :class:`~mpfa_envs.planners.PredictiveControl` drives the next
-    four meters. It needs a map, and keeps off obstacles by the filter of the errand.
+    four meters; eight if it comes back and stands again, and so on. It needs a map, and keeps off
+    obstacles by the filter of the errand.
 
     Args:
         policy: As for :func:`~mpfa_envs.run_tasks`.
@@ -104,7 +106,7 @@ class Rescued:
         if not stands_still(drive.places, errand.time_step * errand.action_repeat):
             return
         if any(math.dist(place, other) <= _SAME for other in drive.stood):
-            drive.left = _LED
+            drive.left, drive.next = drive.next, 2.0 * drive.next
             self.count += 1
             self._planner.begin(robot, errand)
         drive.stood.append(place)
