@@ -14,11 +14,12 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import torch
-from torch import Tensor
 
 from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, Rule, keep, kind_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchrl_mpfa.samplers.table import SignalTable
 
 Bound = Literal["floor", "cap", "none"]

@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from numbers import Integral
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Level = float | Literal["mean"]
 """A reward, or ``"mean"``: the mean reward of the buffer."""
@@ -150,15 +152,15 @@ def check_index(index: Tensor, size: int) -> Tensor:
 
 def check_shape(name: str, value: Any, shape: Sequence[int]) -> Tensor:
     """Return a tensor of this shape; reject anything else by name."""
-    if isinstance(value, Tensor) and value.shape == torch.Size(shape):
+    if isinstance(value, torch.Tensor) and value.shape == torch.Size(shape):
         return value
-    got = f"shape {[*value.shape]}" if isinstance(value, Tensor) else type(value).__name__
+    got = f"shape {[*value.shape]}" if isinstance(value, torch.Tensor) else type(value).__name__
     raise ValueError(f"{name} must be a tensor of shape {[*shape]}, got {got}")
 
 
 def as_mask(name: str, value: Any) -> Tensor:
     """Return booleans given as such or as 0 and 1; reject anything else by name."""
-    if not isinstance(value, Tensor):
+    if not isinstance(value, torch.Tensor):
         raise ValueError(f"{name} must be a tensor of booleans, got {type(value).__name__}")
     # A compiled program looks at no values.
     if value.dtype is torch.bool or torch.compiler.is_compiling():

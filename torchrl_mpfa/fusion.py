@@ -35,7 +35,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch import Tensor
 
 from torchrl_mpfa.checks import (
     BELOW_ONE,
@@ -51,6 +50,8 @@ from torchrl_mpfa.checks import (
 )
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchrl_mpfa.samplers.table import SignalTable
 
 

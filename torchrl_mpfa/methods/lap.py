@@ -8,12 +8,13 @@ experience replay", https://arxiv.org/abs/2007.06049. Its uniform twin PAL is a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
-
-from torch import Tensor
+from typing import TYPE_CHECKING, ClassVar
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.checks import POSITIVE, keep
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
