@@ -2,7 +2,7 @@
 
 ``python -m tests.upstream CHECKOUT``, where CHECKOUT is one of https://github.com/pytorch/rl of
 about the installed version, prints a table: what passes with TorchRL's parts, what with ours, and
-which tests differ. What differs on purpose stands in docs/peers.md.
+which tests differ. What differs on purpose stands in docs/results/upstream.md.
 """
 
 from __future__ import annotations
