@@ -38,4 +38,28 @@ def test_a_typo_is_answered_before_the_parts_of_a_run_are_imported(
 def test_a_script_imports_no_torchrl_before_it_reads_its_command_line(script: str) -> None:
     code = f"import sys, {script}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"torch", *HEAVY} & set(done.stdout.split())
+    assert not {"torch._C", *HEAVY} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("word", ["--help", "metod=per"])
+def test_train_answers_help_and_a_misspelt_word_without_pytorch(word: str) -> None:
+    code = (
+        f"import sys, train; sys.argv = ['train.py', {word!r}]\n"
+        "try: train.main()\n"
+        "finally: print('PARTS', *sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    said, _, modules = done.stdout.partition("PARTS")
+    assert not {"torch._C", *HEAVY} & set(modules.split())
+    assert "method.name" in said if word == "--help" else "did you mean 'method'" in done.stderr
+
+
+def test_what_is_imported_later_is_the_package_itself() -> None:
+    code = (
+        "import sys, training.extra, torch as first\n"
+        "from torch import nn\n"
+        "import torch\n"
+        "assert first is torch is sys.modules['torch'] and nn is torch.nn is first.nn\n"
+        "assert type(torch).__name__ == 'module' and torch.ones(2).sum().item() == 2"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
