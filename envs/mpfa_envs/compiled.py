@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ def njit(function: _Function) -> _Function:
         no_cpython_wrapper=function.__name__.startswith("_"),
     )
     folder, folder_of_others = _cache_folder(), numba.config.CACHE_DIR
+    _listen()
     numba.config.CACHE_DIR = folder
     try:
         compiled: Any = decorate(function, cache=bool(folder))
@@ -49,6 +51,28 @@ def njit(function: _Function) -> _Function:
     finally:
         numba.config.CACHE_DIR = folder_of_others
     return compiled
+
+
+@cache
+def _listen() -> None:
+    """Tell once that loops are compiled: a first start would be silent for half a minute."""
+    from numba.core import event
+
+    class Compiles(event.Listener):
+        def on_start(self, event: Any) -> None:
+            if event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
+                _tell_of_compiling()
+
+        def on_end(self, event: Any) -> None:
+            """Nothing more to tell."""
+
+    event.register("numba:compile", Compiles())
+
+
+@cache
+def _tell_of_compiling() -> None:
+    kept = f", and kept in {folder}" if (folder := _cache_folder()) else ""
+    sys.stderr.write(f"compiling loops: up to half a minute at a first start{kept}\n")
 
 
 @cache

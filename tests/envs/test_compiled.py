@@ -201,3 +201,20 @@ def test_loops_run_and_say_so_once_where_the_cache_is_damaged_or_full(tmp_path: 
     for index in indices:
         index.write_bytes(b"")
     assert re.match(warned.format("EOFError"), run(TWO.format(full=False), **folder))
+
+
+TELLS = """
+sys.stderr = sys.stdout
+import numpy as np
+from mpfa_envs.robots.motion_loops import scale_actions
+from mpfa_envs import ROBOTS
+for _ in range(2):
+    scale_actions(np.zeros((1, 2)), ROBOTS["kobuki"].wheel_limits, np.zeros((1, 2)))
+"""
+
+
+def test_a_start_that_compiles_says_so_once_and_the_next_is_silent(tmp_path: Path) -> None:
+    said = run(TELLS, NUMBA_CACHE_DIR=str(tmp_path))
+    assert said.startswith("compiling loops: up to half a minute at a first start, and kept in")
+    assert str(tmp_path) in said and said.count("\n") == 1
+    assert run(TELLS, NUMBA_CACHE_DIR=str(tmp_path)) == ""

@@ -204,19 +204,21 @@ def best_plan(
     limits, steps, repeat = body.limits, plan.shape[0], body.repeat
     trial, chosen = np.empty_like(plan), np.empty_like(plan)
     # What was planned, from now on.
-    trial[: steps - repeat], trial[steps - repeat :] = plan[repeat:], plan[-1]
-    trial[:repeat] = trial[0]
+    for step in range(steps):
+        _hold(trial, step, step + 1, plan[min(step + repeat, steps - 1)])
+    _hold(trial, 1, repeat, trial[0])
     best = _better(trial, chosen, math.inf, state, body, effort)
     turn = max(steps // 4, repeat)
     for first in range(pairs.shape[0]):
         for second in range(pairs.shape[0]):
-            trial[:turn], trial[turn:] = pairs[first], pairs[second]
+            _hold(trial, 0, turn, pairs[first])
+            _hold(trial, turn, steps, pairs[second])
             best = _better(trial, chosen, best, state, body, effort)
     if best == math.inf:
         return best
     ends = max(steps // 8, repeat), 3 * steps // 8, 5 * steps // 8, steps
     for spread in range(noise.shape[0]):
-        plan[:] = chosen
+        _copy(chosen, plan)
         wide = _SPREAD[spread] * limits.fast
         for sample in range(noise.shape[1]):
             begin = 0
@@ -227,8 +229,23 @@ def best_plan(
                         trial[step, wheel] = min(max(speed, limits.slow), limits.fast)
                 begin = max(begin, ends[knot])
             best = _better(trial, chosen, best, state, body, effort)
-    plan[:] = chosen
+    _copy(chosen, plan)
     return best
+
+
+# Assignments of slices would do, but Numba compiles their errors, too, for two seconds.
+@njit
+def _hold(plan: NDArray[np.float64], first: int, last: int, pair: NDArray[np.float64]) -> None:
+    """Write a pair of speeds to some steps of a plan."""
+    for step in range(first, last):
+        plan[step, 0], plan[step, 1] = pair[0], pair[1]
+
+
+@njit
+def _copy(source: NDArray[np.float64], plan: NDArray[np.float64]) -> None:
+    """Write a plan over another."""
+    for step in range(plan.shape[0]):
+        _hold(plan, step, step + 1, source[step])
 
 
 @njit
@@ -245,14 +262,14 @@ def _better(
         if attempt == 1:
             # It may turn where it may not drive: a sampled plan hardly ever begins with just that.
             turn = 0.5 * (trial[0, 1] - trial[0, 0])
-            trial[: body.repeat, 0], trial[: body.repeat, 1] = -turn, turn
+            _hold(trial, 0, body.repeat, np.array((-turn, turn)))
         waits = _cost_of_waiting(trial, body, effort)
         time = rollout(trial, state, body, effort, best - waits) + waits
         if time >= best:
             return best
         first = np.array(limited(trial[0, 0], trial[0, 1], body.limits))
         if room_after(first, state.speeds, state.points, state.counts, state.kept) > state.least:
-            chosen[:] = trial
+            _copy(trial, chosen)
             return time
         if not effort.blind:
             return best

@@ -149,8 +149,11 @@ def observe_all(
         start = seen.shape[0] - sectors * history
         if history:
             # The last scan moves to the first place of the earlier ones, and these one place on.
-            seen[start + sectors :] = seen[start:-sectors].copy()
-            seen[start : start + sectors] = seen[:sectors]
+            # In loops: for an assignment of slices Numba compiles its errors, too, for two seconds.
+            for index in range(seen.shape[0] - 1, start + sectors - 1, -1):
+                seen[index] = seen[index - sectors]
+            for sector in range(sectors):
+                seen[start + sector] = seen[sector]
         for sector in range(sectors):
             nearest = _sector_range(rays, sector * count, count, median)
             seen[sector] = near / max(nearest, near)
