@@ -190,7 +190,7 @@ def _find_paths(
     """Find the cheapest paths to the goal from the start and from around it."""
     # A* from the goal to the start, with Dial's ring of buckets: as costs are small integers, the
     # cells that wait are kept in a list for each cost, and no heap is needed.
-    ny = levels.shape[1]
+    nx, ny = levels.shape
     costs[:, :] = UNKNOWN
     heads = np.empty(_RING, dtype=np.int64)
     heads[:] = -1
@@ -211,11 +211,17 @@ def _find_paths(
         costs[i, j] = cost
         if i == start[0] and j == start[1]:
             last = total + _AROUND * STRAIGHT
+        own = FACTORS[levels[i, j]]
         for move in range(8):
-            step = _step_cost(levels, i, j, move)
             to_i, to_j = i + _ACROSS[move], j + _UP[move]
-            to = to_i * ny + to_j
-            if step < 0 or cost + step >= found[to]:
+            if to_i < 0 or to_j < 0 or to_i >= nx or to_j >= ny:
+                continue
+            to, length = to_i * ny + to_j, STRAIGHT if move < 4 else DIAGONAL
+            # Most are found already, and cheaper than by any step from here.
+            if cost + length * own >= found[to]:
+                continue
+            step = length * max(own, FACTORS[levels[to_i, to_j]])
+            if cost + step >= found[to]:
                 continue
             rest = _least_cost(to_i, to_j, start)
             if found[to] == UNKNOWN:
