@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,7 +60,8 @@ def _listen() -> None:
 
     class Compiles(event.Listener):
         def on_start(self, event: Any) -> None:
-            if event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
+            module = event.data["dispatcher"].py_func.__module__
+            if module is not None and module.startswith(f"{__package__}."):
                 _tell_of_compiling()
 
         def on_end(self, event: Any) -> None:
@@ -72,7 +73,8 @@ def _listen() -> None:
 @cache
 def _tell_of_compiling() -> None:
     kept = f", and kept in {folder}" if (folder := _cache_folder()) else ""
-    sys.stderr.write(f"compiling loops: up to half a minute at a first start{kept}\n")
+    with suppress(OSError, ValueError, AttributeError):  # It may be closed, or None.
+        sys.stderr.write(f"compiling loops: up to half a minute at a first start{kept}\n")
 
 
 @cache

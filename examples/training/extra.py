@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import sys
 import warnings
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 from typing import Any, TextIO
 
@@ -24,15 +27,51 @@ if _missing:
 
 
 class _Later(ModuleType):
-    """PyTorch until something of it is used: it is executed then, in the same object."""
+    """A package until something of it is used: it is executed then, in the same object."""
 
     def __getattr__(self, name: str) -> Any:
-        spec = self.__spec__
-        assert spec is not None and spec.loader is not None
-        self.__class__ = ModuleType  # type: ignore[assignment]
-        self.__path__ = spec.submodule_search_locations or []
-        spec.loader.exec_module(self)
+        execute(self)
         return getattr(self, name)
+
+
+_lock = RLock()
+_begun: set[str] = set()
+
+
+def execute(module: ModuleType) -> None:
+    """Execute a package that is imported later; other threads wait for it."""
+    with _lock:
+        if isinstance(module, _Later) and module.__name__ not in _begun:
+            assert module.__spec__ is not None and module.__spec__.loader is not None
+            _begun.add(module.__name__)
+            module.__spec__.loader.exec_module(module)
+            module.__class__ = ModuleType  # type: ignore[assignment]
+        elif isinstance(module, _Later):
+            # The package itself asks, in the midst of its import.
+            raise AttributeError(f"module {module.__name__!r} is not imported as far as that yet")
+
+
+class _Parts(MetaPathFinder, Loader):
+    """Executes a package before a part of it is imported, which it may import itself."""
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
+        """Find what the package imported; the usual finders find the rest."""
+        package = sys.modules.get(fullname.partition(".")[0])
+        if isinstance(package, _Later) and package.__name__ not in _begun:
+            execute(package)
+            if (module := sys.modules.get(fullname)) is not None:
+                # Of a module that came meanwhile it is the module's own that counts.
+                self.spec, module.__spec__ = module.__spec__, ModuleSpec(fullname, self)
+                return module.__spec__
+        return None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Return what is there already."""
+        return sys.modules[spec.name]
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Leave it as it is."""
+        module.__spec__ = self.spec
 
 
 def import_later(name: str) -> None:
@@ -44,8 +83,7 @@ def import_later(name: str) -> None:
     if spec is not None:
         module = sys.modules[name] = module_from_spec(spec)
         module.__class__ = _Later
-        # To import a part of it asks for this.
-        del module.__path__
+        sys.meta_path.insert(0, _Parts())
 
 
 import_later("torch")

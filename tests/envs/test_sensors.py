@@ -104,6 +104,9 @@ def test_noise_of_a_sensor_is_the_same_in_a_state_that_is_loaded() -> None:
     other.load_state_dict(env.state_dict())
     first, second = (each.step(np.ones((2, 2), np.float32))[0] for each in (env, other))
     np.testing.assert_array_equal(first, second)
+    turned: Any = {"rear": LidarSensor(noise=0.05, dropout=0.1, mount=(0.0, 0.0, 90.0))}
+    with pytest.raises(ValueError, match="sensors"):
+        VectorNavigationEnv(2, world="A", sensors=turned, **TASK).load_state_dict(env.state_dict())
     with pytest.raises(ValueError, match="sensors"):
         VectorNavigationEnv(2, world="A", **TASK).load_state_dict(env.state_dict())
 
@@ -137,9 +140,17 @@ def test_the_filter_and_the_mirror_of_a_task_take_its_observations() -> None:
         ({"it": Bearing(width=0)}, "width must be"),
         ({"it": Bearing(bounds=(1.0, 1.0))}, "bounds must rise"),
         ({"it": Bearing(mirrored=[1])}, "each place once"),
+        ({"it": Bearing(mirrored=5)}, "each place once"),
+        ({"it": Bearing(bounds=(0.0, 1.0, 2.0))}, "the least and the greatest"),  # type: ignore[arg-type]
+        (REAR, "objects by name"),
+        (5, "objects by name"),
+        ([REAR], "objects by name"),
+        ({1: REAR}, "text as names"),
+        (["known", "known"], "named once each"),
     ],
 )
 def test_sensors_that_cannot_be_are_rejected(sensors: Any, message: str) -> None:
+    SENSORS["known"] = REAR
     with pytest.raises(ValueError, match=message):
         TaskConfig(sensors=sensors, **TASK)
 
@@ -158,7 +169,7 @@ def test_what_a_sensor_gives_is_checked(sensor: Bearing, message: str) -> None:
         env.reset(seed=0)
 
 
-@pytest.mark.parametrize("mount", [(0.0, 0.0), (0.0, 0.0, np.nan)])
+@pytest.mark.parametrize("mount", [(0.0, 0.0), (0.0, 0.0, np.nan), 3, "abc"])
 def test_a_mount_that_is_none_is_rejected(mount: Any) -> None:
     with pytest.raises(ValueError, match="mount must be"):
         LidarSensor(mount=mount)

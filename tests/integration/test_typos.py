@@ -54,12 +54,42 @@ def test_train_answers_help_and_a_misspelt_word_without_pytorch(word: str) -> No
     assert "method.name" in said if word == "--help" else "did you mean 'method'" in done.stderr
 
 
-def test_what_is_imported_later_is_the_package_itself() -> None:
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import torch.optim as part",
+        "from torch.utils import data as part",
+        "import torch.distributions as part",
+        "import torch.autograd as part",
+        "import torch.cuda as part",
+        "import torch._dynamo.exc as part",
+        "import torch; from torch import nn as part",
+    ],
+)
+def test_what_is_imported_later_is_the_package_itself_whatever_is_asked_for_first(
+    first: str,
+) -> None:
     code = (
-        "import sys, training.extra, torch as first\n"
-        "from torch import nn\n"
-        "import torch\n"
-        "assert first is torch is sys.modules['torch'] and nn is torch.nn is first.nn\n"
+        f"import sys, training.extra\n{first}\n"
+        "import torch, torch.optim, torch.cuda, torch.utils.data, torch.nn.functional\n"
+        "assert part is sys.modules[part.__name__] and part.__spec__.loader is not None\n"
+        "assert part.__spec__.origin == part.__file__\n"
+        "for name in ('optim', 'cuda', 'nn', 'utils', 'distributions', 'autograd'):\n"
+        "    assert getattr(torch, name) is sys.modules['torch.' + name]\n"
+        "assert torch.cuda.memory and torch.nn.grad and torch.utils._pytree\n"
         "assert type(torch).__name__ == 'module' and torch.ones(2).sum().item() == 2"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_threads_that_ask_at_once_for_what_is_imported_later_all_get_it() -> None:
+    code = (
+        "import training.extra, torch\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "with ThreadPoolExecutor(4) as pool:\n"
+        "    found = list(pool.map(lambda _: torch.ones(2).sum().item(), range(4)))\n"
+        "assert found == [2.0] * 4"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

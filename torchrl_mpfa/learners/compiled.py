@@ -26,8 +26,6 @@ from tensordict import TensorDict, TensorDictBase, is_non_tensor, is_tensor_coll
 from tensordict.utils import NestedKey
 from torch import Tensor, fx
 from torch._inductor import config
-from torch._inductor.compile_fx import compile_fx_inner
-from torch._inductor.decomposition import select_decomp_table
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -268,6 +266,10 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
         return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
     # Inductor's compiler itself: the layers of ``torch.compile`` around it would record once more,
     # three seconds at the start, and would take a tenth of an update.
+    # Imported here, as it takes a second and many learners are not compiled.
+    from torch._inductor.compile_fx import compile_fx_inner
+    from torch._inductor.decomposition import select_decomp_table
+
     mode = FakeTensorMode()
     on_cpu = all(value.device.type == "cpu" for value in inputs)
     # Random numbers are those that the losses would have.

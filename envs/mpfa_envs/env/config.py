@@ -28,7 +28,7 @@ from mpfa_envs.robots.resolve import resolve_robot
 from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
-from mpfa_envs.sensing.sensors import Sensor, resolve_sensors
+from mpfa_envs.sensing.sensors import Sensor, describe_sensors, resolve_sensors
 from mpfa_envs.tasks.reward import (
     PROGRESS_SCALE,
     RewardFunction,
@@ -413,8 +413,7 @@ class TaskConfig:
         )
         described["latency"] = list(self.latency) if self.latency[1] > 0.0 else None
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
-        widths = {name: sensor.width for name, sensor in self.sensors.items()}
-        described["sensors"] = widths or None
+        described["sensors"] = describe_sensors(self.sensors)
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):
             described["reward"] = "navigation_reward"

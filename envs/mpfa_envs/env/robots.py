@@ -314,8 +314,8 @@ class RobotBatch:
             self.observations[:, : self._own],
         )
         if sensors := self._config.sensors:
-            motions, goals = self.episodes.motions.copy(), self.episodes.goals.copy()
-            sight = Sight(motions, goals, chosen, self.worlds.arrays, rngs)
+            motions = self.episodes.motions.copy()
+            sight = Sight(motions, chosen.copy(), self.worlds.arrays, rngs)
             write_sensed(sensors, sight, self.observations[:, self._own :])
 
     def measurements(self) -> NDArray[np.float64]:

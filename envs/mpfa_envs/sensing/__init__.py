@@ -7,4 +7,13 @@
 
 The rays, the maps and the observations of many robots are computed in compiled loops, which are in
 ``lidar_loops``, ``map_loops`` and ``observation``.
+
+| of | a simulated lidar | a real one |
+|---|---|---|
+| rays | ``lidar``, ``lidar_loops`` | ``scan`` |
+| sectors | ``observation`` | ``sectors``, ``glances``: what a turn hides |
+| maps | ``map_memory``, ``map_loops`` | the same, and ``hits``: what has gone |
+| walls of a plan | ``standing`` | the same |
+
+Sensors beside the lidar are in ``sensors``, mirror images of all in ``mirror``.
 """

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, got
+from mpfa_envs.checks import check_count, check_number, check_positive, got, plain
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.worlds.world import World
 
@@ -25,8 +25,6 @@ class Sight(NamedTuple):
 
     motions: NDArray[np.float64]
     """Poses and speeds [m, m, rad, m/s, rad/s], ``[N, 5]``."""
-    goals: NDArray[np.float64]
-    """Goals (x, y) [m], ``[N, 2]``."""
     chosen: NDArray[np.bool_]
     """Which robots sense now, ``[N]``; what is given for the others is not looked at."""
     worlds: BatchArrays
@@ -59,7 +57,8 @@ class Sensor(Protocol):
 class LidarSensor:
     """A second lidar: closeness ``min(closeness_distance / range, 1)`` of each of its sectors.
 
-    The map, the filter and a :class:`~mpfa_envs.deploy.Pilot` do not know of it.
+    The map, the filter and a :class:`~mpfa_envs.deploy.Pilot` do not know of it. With a latency it
+    shows what is around the robot now, while the first lidar is seen from where orders will act.
 
     Args:
         mount: Its place (x, y) in the robot's frame [m] and where it looks, to the left [deg].
@@ -96,10 +95,11 @@ class LidarSensor:
     """The least and the greatest value."""
 
     def __post_init__(self) -> None:
-        if len(self.mount) != 3:
-            raise ValueError(f"mount must be x, y [m] and an angle [deg], got {self.mount!r}")
-        for number in self.mount:
-            check_number("mount", number)
+        mount = self.mount
+        if not isinstance(mount, Sequence) or isinstance(mount, str) or len(mount) != 3:
+            raise ValueError(f"mount must be x, y [m] and an angle [deg], got {mount!r}")
+        x, y, angle = (check_number("mount", number) for number in mount)
+        object.__setattr__(self, "mount", (x, y, angle))
         check_positive("closeness_distance", self.closeness_distance)
         _ = self._lidar
 
@@ -153,28 +153,61 @@ def resolve_sensors(sensors: Any) -> Mapping[str, Sensor]:
     if isinstance(sensors, Mapping):
         found = dict(sensors)
     else:
-        names = [sensors] if isinstance(sensors, str) else list(sensors or ())
+        names = [sensors] if isinstance(sensors, str) else sensors or ()
+        if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+            raise ValueError(
+                f"sensors must be objects by name, {{'rear': LidarSensor()}}, or names, got "
+                f"{sensors!r}"
+            )
         for name in names:
             if name not in SENSORS:
                 raise ValueError(
                     f"sensors must be names in SENSORS, {sorted(SENSORS)}, {got(name, SENSORS)}: "
                     "register it first, in scripts by a plugin"
                 )
+        if len(set(names)) < len(names):
+            raise ValueError(f"sensors must be named once each, got {list(names)}")
         found = {name: SENSORS[name] for name in names}
     for name, sensor in found.items():
-        if isinstance(sensor, type) or not isinstance(sensor, Sensor):
-            raise ValueError(
-                f"sensors[{name!r}] must have width, bounds, mirrored and sense, got {sensor!r}"
-            )
-        check_count(f"sensors[{name!r}].width", sensor.width)
-        low, high = (check_number(f"sensors[{name!r}].bounds", b) for b in sensor.bounds)
-        if not low < high:
-            raise ValueError(f"sensors[{name!r}].bounds must rise, got {sensor.bounds!r}")
-        if sensor.mirrored is not None and sorted(sensor.mirrored) != list(range(sensor.width)):
-            raise ValueError(
-                f"sensors[{name!r}].mirrored must have each place once, got {sensor.mirrored!r}"
-            )
+        _check_sensor(name, sensor)
     return found
+
+
+def _check_sensor(name: Any, sensor: Any) -> None:
+    """Raise if an object is no sensor, or its numbers cannot be."""
+    if not isinstance(name, str):
+        raise ValueError(f"sensors must have text as names, got {name!r}")
+    where = f"sensors[{name!r}]"
+    if isinstance(sensor, type) or not isinstance(sensor, Sensor):
+        raise ValueError(f"{where} must have width, bounds, mirrored and sense, got {sensor!r}")
+    check_count(f"{where}.width", sensor.width)
+    bounds, mirrored = sensor.bounds, sensor.mirrored
+    if not isinstance(bounds, Sequence) or len(bounds) != 2:
+        raise ValueError(f"{where}.bounds must be the least and the greatest, got {bounds!r}")
+    low, high = (check_number(f"{where}.bounds", bound) for bound in bounds)
+    if not low < high:
+        raise ValueError(f"{where}.bounds must rise, got {bounds!r}")
+    places = mirrored if isinstance(mirrored, Sequence) else []
+    if mirrored is not None and sorted(places) != list(range(sensor.width)):
+        raise ValueError(f"{where}.mirrored must have each place once, got {mirrored!r}")
+
+
+def describe_sensors(sensors: Mapping[str, Sensor]) -> dict[str, Any] | None:
+    """Plain values by name, which saved states must share; None without sensors."""
+    described = {}
+    for name, each in sensors.items():
+        own: dict[str, Any] = (
+            asdict(each) if is_dataclass(each) and not isinstance(each, type) else {}
+        )
+        mirrored = None if each.mirrored is None else list(each.mirrored)
+        facts = {"kind": type(each).__name__, "width": each.width, "mirrored": mirrored}
+        described[name] = {
+            entry: [*value] if isinstance(value, tuple) else plain(value)
+            for entry, value in {**own, **facts, "bounds": tuple(each.bounds)}.items()
+            # Arrays and objects of a user are not compared.
+            if isinstance(value, bool | int | float | str | tuple | list | None)
+        }
+    return described or None
 
 
 def write_sensed(

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch._inductor import config
+from torch._inductor import compile_fx, config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -165,7 +165,7 @@ def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_
         return SimpleNamespace(current_callable=lambda values: module.forward(*values))
 
     monkeypatch.setattr(program, "_COMPILED", {})
-    monkeypatch.setattr(program, "compile_fx_inner", compile)
+    monkeypatch.setattr(compile_fx, "compile_fx_inner", compile)
     learners = make_pair("td3", True, policy_delay=1)
     for seed in range(3):
         update_both(learners, seed)
