@@ -59,8 +59,10 @@ def registered() -> Iterator[None]:
         table.update(before)  # type: ignore[arg-type]
 
 
-def test_a_second_lidar_sees_what_a_lidar_there_would() -> None:
-    env = VectorNavigationEnv(3, world="D", sensors={"rear": REAR}, **TASK)
+@pytest.mark.parametrize("angle", [180.0, 70.0])
+def test_a_second_lidar_sees_what_a_lidar_there_would(angle: float) -> None:
+    sensor = LidarSensor(mount=(-0.1, 0.05, angle), sectors=6, field_of_view=120.0)
+    env = VectorNavigationEnv(3, world="D", sensors={"rear": sensor}, **TASK)
     plain = VectorNavigationEnv(3, world="D", **TASK)
     seen, _ = env.reset(seed=3)
     before, _ = plain.reset(seed=3)
@@ -71,7 +73,7 @@ def test_a_second_lidar_sees_what_a_lidar_there_would() -> None:
             ahead, left = -0.1, 0.05
             x += ahead * np.cos(heading) - left * np.sin(heading)
             y += ahead * np.sin(heading) + left * np.cos(heading)
-            ranges = lidar.scan(x, y, heading + np.pi)
+            ranges = lidar.scan(x, y, heading + np.radians(angle))
             expected = 0.25 / np.maximum(ranges, 0.25)
             np.testing.assert_allclose(row[SIZE:], expected, atol=1e-6)
         seen = env.step(np.full((3, 2), 0.8, np.float32))[0]
