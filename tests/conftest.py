@@ -85,10 +85,25 @@ def fixed_seed():
         torch.cuda.manual_seed_all(0)
 
 
+REGISTRIES = (
+    ("torchrl_mpfa.methods", "METHODS"),
+    ("torchrl_mpfa.methods.registered", "SIGNALS"),
+    ("mpfa_envs", "ROBOTS"),
+    ("mpfa_envs", "SENSORS"),
+    ("mpfa_envs", "REWARDS"),
+    ("mpfa_envs.generators.generate", "_registered"),
+)
+
+
 @pytest.fixture(autouse=True)
-def built_in_generators():
-    """A generator that a test registers, or a page that it runs, is gone afterwards."""
+def registries():
+    """What a test registers, or a page or plugin that it runs, is gone afterwards."""
+    found = [
+        getattr(sys.modules[module], name) for module, name in REGISTRIES if module in sys.modules
+    ]
+    before = [dict(registry) for registry in found]
     yield
-    module = sys.modules.get("mpfa_envs.generators.generate")
-    for name in set(module.GENERATORS) - set(module._BUILT_IN) if module else ():
-        module._registered.pop(name, None)
+    for registry, names in zip(found, before, strict=True):
+        if registry != names:
+            registry.clear()
+            registry.update(names)

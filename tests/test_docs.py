@@ -30,8 +30,6 @@ from mpfa_envs import (
     planners,
     render,
 )
-from torchrl_mpfa.methods import METHODS
-from torchrl_mpfa.methods.registered import SIGNALS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -191,15 +189,11 @@ def run(page: str, changes: dict[str, str]) -> dict[str, Any]:
     for size, small in changes.items():
         assert size in text
         text = text.replace(size, small)
-    before = dict(METHODS), dict(SIGNALS)
     try:
         for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             exec(block, names)
     finally:
         torch.set_flush_denormal(False)
-        for registered, names_before in zip((METHODS, SIGNALS), before, strict=True):
-            registered.clear()
-            registered.update(names_before)
     return names
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,17 +45,6 @@ class Bearing:
 
     def sense(self, sight: Sight) -> NDArray[np.float64]:
         return self.factor * sight.motions[:, 2:3]
-
-
-@pytest.fixture(autouse=True)
-def registered() -> Iterator[None]:
-    """Forget what a test registers."""
-    sensors, rewards = dict(SENSORS), dict(REWARDS)
-    SENSORS.clear()
-    yield
-    for table, before in ((SENSORS, sensors), (REWARDS, rewards)):
-        table.clear()
-        table.update(before)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("angle", [180.0, 70.0])

@@ -13,12 +13,10 @@ from tensordict import TensorDict
 
 import compare
 import train
-from mpfa_envs import ROBOTS
-from mpfa_envs.generators import generate
 from tests.integration.tiny_runs import OVERRIDES, rows, stop_after, tiny
 from tests.integration.tiny_runs import go_on as train_on
 from tests.integration.tiny_runs import train as train_tiny
-from torchrl_mpfa.methods import METHODS, SIGNALS, OwnSignals, register_signal
+from torchrl_mpfa.methods import METHODS, OwnSignals, register_signal
 from training import files
 from training.comparison.jobs import Evaluation, Job
 from training.plugins import load_plugin, with_plugin
@@ -55,12 +53,7 @@ def mine(tmp_path: Path) -> Iterator[Path]:
     """A plugin, of which nothing stays."""
     file = tmp_path / "mine_of_a_test.py"
     file.write_text(MINE)
-    known = METHODS, ROBOTS, SIGNALS, generate._registered
-    before = [dict(each) for each in known]
     yield file
-    for each, names in zip(known, before, strict=True):
-        each.clear()
-        each.update(names)
     sys.modules.pop(file.stem, None)
     known_settings.cache_clear()
 
@@ -181,7 +174,6 @@ def test_what_is_no_plugin_is_one_line(
         load_plugin(file)
     with pytest.raises(SystemExit):
         compare.parse(["--plugin", str(file)])
-    METHODS.pop("mine", None)
 
 
 def test_a_signal_of_another_shape_is_rejected_by_name(mine: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,7 +9,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_mpfa import ActorCritic, make_actor, make_critic, make_replay, run_updates
 from torchrl_mpfa.methods import (
     METHODS,
-    SIGNALS,
     OwnSignals,
     Scaled,
     loss_options,
@@ -31,11 +28,9 @@ class Counted:
 
 
 @pytest.fixture
-def registered() -> Iterator[None]:
+def registered() -> None:
     register_signal("size", Counted)
     METHODS["mine"] = Scaled("mine", signals=["td_error", "size"])
-    yield
-    del SIGNALS["size"], METHODS["mine"]
 
 
 @pytest.mark.usefixtures("registered")

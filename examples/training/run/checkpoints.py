@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -14,9 +14,6 @@ from torchrl_mpfa.saving import load_safely
 from training import files
 from training.run.assembly import make_learner, method_of
 from training.settings.train import TrainSettings, as_settings
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT = 7
 """7: networks and targets of a learner; 5: many robots, in the middle of their episodes."""
