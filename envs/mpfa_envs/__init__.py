@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mpfa_envs.driver import Filtered as Filtered
     from mpfa_envs.env.config import PAPER_TASK as PAPER_TASK
     from mpfa_envs.env.config import TaskConfig as TaskConfig
     from mpfa_envs.env.hindsight import GoalRelabeling as GoalRelabeling
@@ -70,6 +71,7 @@ EXAMPLE_ROBOT = Path(__file__).parent / "assets" / "robots" / "example.yaml"
 """A robot file to start your own from."""
 
 _NAMES = {
+    "driver": "Filtered",
     "env.config": "PAPER_TASK TaskConfig",
     "env.hindsight": "GoalRelabeling",
     "env.navigation": "NavigationEnv",

@@ -147,8 +147,7 @@ class Filtered:
             carried out, ``[N, 2]``; a :class:`~mpfa_envs.SafetyFilter`, say.
 
     Examples:
-        >>> from mpfa_envs import TaskConfig, evaluate
-        >>> from mpfa_envs.driver import Filtered
+        >>> from mpfa_envs import Filtered, TaskConfig, evaluate
         >>> task = {"robot": "kobuki", "physics": "kinematic"}
         >>> ahead = lambda observations: np.ones((len(observations), 2))
         >>> careful = Filtered(ahead, TaskConfig(**task).make_filter())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -257,8 +258,8 @@ BIG = replace(ROBOTS["kobuki"], name="big", radius=0.35)
     [
         (make_planner("astar", robot="kobuki"), BIG, "with robot='big': name .* radius 0.18 and"),
         (make_planner("dijkstra"), "kobuki", "robot='kobuki': .*, min_wheel_speed 0.05 and -0.7"),
-        (load_policy("td3-rooms"), replace(ROBOTS["kobuki"], wheel_acceleration=0.2),
-         "'kobuki' with robot='kobuki': wheel_acceleration 0.8 and 0.2 differ"),
+        (load_policy("td3-turtlebot2"), replace(ROBOTS["turtlebot2"], wheel_acceleration=0.2),
+         "'turtlebot2' with robot='turtlebot2': wheel_acceleration .* and 0.2 differ"),
         (Filtered(load_policy("td3-rooms"), TaskConfig(robot="waffle", memory="map").make_filter()),
          "kobuki", "filter must be .*, got one for 'waffle' with robot='kobuki'"),
     ],
@@ -268,6 +269,18 @@ def test_a_policy_for_another_robot_is_warned_of(
 ) -> None:
     with pytest.warns(UserWarning, match=message):
         evaluate(policy, "A", episodes=1, physics="kinematic", robot=robot, max_steps=2)
+
+
+def test_a_policy_that_learned_behind_the_filter_and_has_none_is_warned_of() -> None:
+    policy = load_policy("td3-rooms")
+    assert policy.card["filter"]
+    with pytest.warns(UserWarning, match="learned behind the filter and drives without it"):
+        evaluate(policy, "A", episodes=1, max_steps=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        behind = Filtered(policy, TaskConfig(**policy.env_arguments).make_filter())
+        evaluate(behind, "A", episodes=1, max_steps=2, **policy.env_arguments)
+        evaluate(load_policy("td3-paper"), "A", episodes=1, max_steps=2)
 
 
 @pytest.mark.parametrize("name", POLICIES)
@@ -280,5 +293,9 @@ def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
         "robot", "physics", "action_repeat", "closeness_distance", *memory,
     }  # fmt: skip
     assert policy.env_arguments.items() >= memory.items()
-    results = evaluate(policy, "D", episodes=10, seed=4711, physics="kinematic")
+    driver = policy
+    if policy.card.get("filter"):
+        driver = Filtered(policy, TaskConfig(**policy.env_arguments).make_filter())
+    arguments = policy.env_arguments | {"physics": "kinematic"}
+    results = evaluate(driver, "D", episodes=10, seed=4711, **arguments)
     assert sum(found.success for found in results) >= 9

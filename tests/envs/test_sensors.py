@@ -25,6 +25,8 @@ from mpfa_envs import (
     TaskConfig,
     VectorNavigationEnv,
     export_policy,
+    load_policy,
+    save_policy,
 )
 from mpfa_envs.deploy.card import CardError
 from mpfa_envs.policies.layers import Linear
@@ -185,3 +187,59 @@ def test_a_policy_with_sensors_is_no_policy_of_a_robot(tmp_path: Any) -> None:
     policy = Policy(layers, env_arguments={"sensors": ["rear"], **TASK})
     with pytest.raises(CardError, match="by its lidar alone, not by rear"):
         export_policy(policy, tmp_path / "policy.onnx")
+
+
+def policy_with(*sensors: str) -> Policy:
+    layers = [Linear(np.ones((2, SIZE + 6), np.float32), np.zeros(2, np.float32))]
+    return Policy(layers, env_arguments={"sensors": [*sensors], **TASK})
+
+
+def test_a_policy_keeps_the_values_of_its_lidar_whatever_has_its_name_later(tmp_path: Any) -> None:
+    SENSORS["rear"] = REAR
+    save_policy(policy_with("rear"), tmp_path)
+    SENSORS["rear"] = LidarSensor(mount=(0.0, 0.0, 0.0), sectors=9)
+    loaded = load_policy(tmp_path)
+    assert TaskConfig(**loaded.env_arguments).sensors == {"rear": REAR}
+    del SENSORS["rear"]
+    assert TaskConfig(**loaded.env_arguments).sensors == {"rear": REAR}
+
+
+def test_a_policy_with_a_sensor_of_your_own_asks_for_the_same_one(tmp_path: Any) -> None:
+    SENSORS["it"] = Bearing()
+    save_policy(policy_with("it"), tmp_path)
+    loaded = load_policy(tmp_path)
+    assert TaskConfig(**loaded.env_arguments).sensors == {"it": SENSORS["it"]}
+    SENSORS["it"] = Bearing(width=2)
+    with pytest.raises(ValueError, match=r"sensors\['it'\].width must be 1, as when .*got 2"):
+        TaskConfig(**loaded.env_arguments)
+    del SENSORS["it"]
+    with pytest.raises(ValueError, match=r"names in SENSORS.*got 'it'.*plugin"):
+        TaskConfig(**loaded.env_arguments)
+
+
+def test_a_reward_senses_after_each_time_step() -> None:
+    seen: list[float] = []
+
+    def near(outcome: StepOutcome) -> RewardTerms:
+        seen.append(float(outcome.sense("rear").max()))
+        return RewardTerms(other=-seen[-1])
+
+    env = VectorNavigationEnv(
+        2, world="A", sensors={"rear": REAR, "it": Bearing()}, reward=near, **TASK
+    )
+    env.reset(seed=0)
+    sensed, rewards, *_ = env.step(-np.ones((2, 2), np.float32))
+    assert len(seen) == 4
+    np.testing.assert_allclose(rewards, [-seen[0] - seen[2], -seen[1] - seen[3]])
+    # Where the action ended, the reward and the observation have the same.
+    rear = sensed[:, env.config.observation_slices["rear"]]
+    np.testing.assert_allclose(rear.max(1), seen[2:])
+    assert seen[0] != seen[2]
+    other = VectorNavigationEnv(
+        1, world="A", reward=lambda outcome: outcome.sense("raer"), sensors={"rear": REAR}, **TASK
+    )
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match=r"'rear'.*got 'raer' \(did you mean 'rear'\?\)"):
+        other.step(np.ones((1, 2), np.float32))
+    with pytest.raises(ValueError, match="that of a sensor of the task, got 'rear'"):
+        StepOutcome(2.0, 1.9, False, False, 1.0, 0.4, 0.0).sense("rear")

@@ -10,7 +10,7 @@ import pytest
 
 import ddpg
 from mpfa_envs import Policy, load_policy
-from training.evaluating import drive
+from training.evaluating import as_trained, drive
 
 
 def train(folder: Path, *, seed: int = 0, actions: int = 384) -> Policy:
@@ -31,7 +31,7 @@ def test_a_trained_policy_drives_as_evaluate_drives_it(tmp_path: Path) -> None:
         **{"learner": "ddpg", "method": "mpfa_per", "filter": True},
         **{"seed": 0, "steps": 384},
     }
-    [driven] = drive(policy, ["A"], episodes=2, seed=0, physics=None, progress=False)
+    [driven] = drive(as_trained(policy), ["A"], episodes=2, seed=0, physics=None, progress=False)
     assert len(driven.results) == 2
 
 

@@ -125,7 +125,7 @@ def test_a_resumed_run_asks_for_its_plugin_and_warns_of_another(
     assert "warning" not in capsys.readouterr().err
     mine.write_text(MINE + "\n")
     assert run_script(monkeypatch, *again, "actions=80") == 0
-    assert "another plugin than when the run was saved" in capsys.readouterr().err
+    assert "the plugin has changed since the run was saved" in capsys.readouterr().err
 
 
 def test_a_comparison_gives_its_plugin_to_every_command(mine: Path, tmp_path: Path) -> None:

@@ -193,7 +193,8 @@ def _read(path: Path, what: str, most: int) -> bytes:
     try:
         return read_file(path, most)
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no {what} at {path}") from None
+        remedy = "export_policy, or the script export.py, writes both files"
+        raise FileNotFoundError(f"there is no {what} at {path}: {remedy}") from None
     except OSError as error:
         raise CardError(f"{path} is no {what}: {error}") from error
 

@@ -63,7 +63,7 @@ class GoalRelabeling:
         if payments is None:
             raise ValueError(
                 f"reward must be None or navigation_reward with goals in hindsight, got "
-                f"{config.reward!r}"
+                f"{getattr(config.reward, '__name__', config.reward)!r}"
             )
         if payments[2] != 0:
             raise ValueError(

@@ -33,7 +33,7 @@ from mpfa_envs.sensing.observation import (
     look_from,
     observe_all,
 )
-from mpfa_envs.sensing.sensors import Sight, write_sensed
+from mpfa_envs.sensing.sensors import Sight, sense_with, write_sensed
 from mpfa_envs.sensing.standing import standing_hits, standing_sectors
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
@@ -209,7 +209,7 @@ class RobotBatch:
             if self._fields is not None:
                 measure_remaining(episodes, running, self._fields)
             if self._payments is None:
-                self._pay_by_function(running)
+                self._pay_by_function(running, rngs)
             if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0, 0.0)):
                 break
         np.copyto(self.running, running, where=moving)
@@ -270,9 +270,12 @@ class RobotBatch:
             self.advance(table[step], moving, rngs)
             self.sense(moving, rngs)
 
-    def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
+    def _pay_by_function(
+        self, running: NDArray[np.bool_], rngs: Sequence[np.random.Generator]
+    ) -> None:
         """Add the rewards of the user's function, robot by robot."""
         episodes = self.episodes
+        sight = Sight(episodes.motions, running, self.worlds.arrays, rngs)
         for index in np.flatnonzero(running).tolist():
             outcome = StepOutcome(
                 float(episodes.remaining[1, index]),
@@ -280,7 +283,9 @@ class RobotBatch:
                 bool(episodes.flags[0, index]),
                 bool(episodes.flags[1, index]),
                 float(episodes.clearances[index]),
-                *episodes.motions[index, 3:].tolist(),
+                float(episodes.motions[index, 3]),
+                float(episodes.motions[index, 4]),
+                sense=partial(sense_with, self._config.sensors, index, sight),
             )
             episodes.numbers[REWARD : REWARD + 4, index] += read_terms(
                 self._config.reward_function(outcome)

@@ -123,7 +123,8 @@ def run_tasks(
             nothing has moved then; or if the policy gives no action for each observation.
 
     Warns:
-        UserWarning: If the policy, the planner or the filter is for another robot.
+        UserWarning: If the policy, the planner or the filter is for another robot, or the policy
+            learned behind a filter and has none.
     """
     for name in ("world", "num_envs", "autoreset_mode"):
         if name in env_arguments:
@@ -135,6 +136,12 @@ def run_tasks(
         envs_at_once = ENVS_AT_ONCE if takes_many else 1
     check_count("envs_at_once", envs_at_once)
     _warn_of_another_robot(policy, resolve_robot(env_arguments.get("robot", "turtlebot2")))
+    if getattr(policy, "card", {}).get("filter"):
+        warnings.warn(
+            "policy learned behind the filter and drives without it: Filtered(policy, "
+            "TaskConfig(**policy.env_arguments).make_filter()) has it",
+            stacklevel=2,
+        )
     driver = as_driver(policy, alone=envs_at_once == 1)
     # Each task has its own seed, whichever robot drives it.
     tasks = [

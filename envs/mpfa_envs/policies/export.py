@@ -98,9 +98,9 @@ def export_policy(
 
 def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """The card of a policy as plain values, without its file."""
+    if further := policy.env_arguments.get("sensors"):
+        raise CardError(f"a robot senses by its lidar alone, not by {', '.join(further)}")
     config = TaskConfig(**policy.env_arguments)
-    if config.sensors:
-        raise CardError(f"a robot senses by its lidar alone, not by {', '.join(config.sensors)}")
     lidar = config.make_lidar()
     robot = config.robot
     document = {

@@ -20,6 +20,7 @@ from mpfa_envs.deploy.card import CardError, Network, read_exported
 from mpfa_envs.files import cause_of, check_replaceable, read_file, write_atomically
 from mpfa_envs.policies.layers import KINDS, Layer, arrays_of, check_layers, from_torch
 from mpfa_envs.robots.resolve import resolve_robot
+from mpfa_envs.sensing.sensors import describe_sensors, resolve_sensors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class Policy:
         card: Plain values that say what it is: how it was trained, what it can do.
         env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv` under which it senses and
             acts as it learned to: robot, physics, time limit, action repeat, closeness distance.
-            The robot, however it is given, is kept as its fields.
+            The robot and further sensors, however they are given, are kept as their values.
 
     Raises:
         ValueError: If the layers do not fit together, a weight is not finite, or the card or the
@@ -68,6 +69,8 @@ class Policy:
         if "robot" in arguments:
             # Its fields, so that a policy does not depend on a file, or on what a name stands for.
             arguments["robot"] = asdict(resolve_robot(arguments["robot"]))
+        if "sensors" in arguments and not _are_described(arguments["sensors"]):
+            arguments["sensors"] = describe_sensors(resolve_sensors(arguments["sensors"])) or {}
         self.env_arguments: dict[str, Any] = _plain("env_arguments", arguments)
 
     @classmethod
@@ -130,6 +133,11 @@ class Policy:
     def __repr__(self) -> str:
         kinds = ", ".join(type(layer).__name__ for layer in self.layers)
         return f"Policy({self.observation_size} -> {self.action_size}: {kinds})"
+
+
+def _are_described(sensors: Any) -> bool:
+    """Return True if sensors are given as their values, as in a file."""
+    return isinstance(sensors, Mapping) and all(isinstance(e, Mapping) for e in sensors.values())
 
 
 def _plain(name: str, values: Mapping[str, Any]) -> dict[str, Any]:

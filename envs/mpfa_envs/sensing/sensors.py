@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, runtime_checkable
 
@@ -41,12 +41,20 @@ class Sensor(Protocol):
     It keeps nothing from one call to the next: episodes that are loaded are driven again.
     """
 
-    width: int
-    """Number of values."""
-    bounds: tuple[float, float]
-    """The least and the greatest value."""
-    mirrored: Sequence[int] | None
-    """Places of the values in the mirror image of left and right; None: there is none."""
+    @property
+    def width(self) -> int:
+        """Number of values."""
+        ...
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the greatest value."""
+        ...
+
+    @property
+    def mirrored(self) -> Sequence[int] | None:
+        """Places of the values in the mirror image of left and right; None: there is none."""
+        ...
 
     def sense(self, sight: Sight) -> NDArray[np.floating[Any]]:
         """Sense with all robots; return values within the bounds, ``[N, width]``."""
@@ -149,9 +157,12 @@ SENSORS: Final[dict[str, Sensor]] = {}
 
 
 def resolve_sensors(sensors: Any) -> Mapping[str, Sensor]:
-    """Find sensors: a mapping of them by name, or names in :data:`SENSORS`."""
+    """Find sensors: a mapping of them by name, or of what describes them, or names in SENSORS."""
     if isinstance(sensors, Mapping):
-        found = dict(sensors)
+        found = {
+            name: _find_described(name, each) if isinstance(each, Mapping) else each
+            for name, each in sensors.items()
+        }
     else:
         names = [sensors] if isinstance(sensors, str) else sensors or ()
         if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
@@ -159,17 +170,37 @@ def resolve_sensors(sensors: Any) -> Mapping[str, Sensor]:
                 f"sensors must be objects by name, {{'rear': LidarSensor()}}, or names, got "
                 f"{sensors!r}"
             )
-        for name in names:
-            if name not in SENSORS:
-                raise ValueError(
-                    f"sensors must be names in SENSORS, {sorted(SENSORS)}, {got(name, SENSORS)}: "
-                    "register it first, in scripts by a plugin"
-                )
-        if len(set(names)) < len(names):
+        found = {name: _find(name) for name in names}
+        if len(found) < len(names):
             raise ValueError(f"sensors must be named once each, got {list(names)}")
-        found = {name: SENSORS[name] for name in names}
     for name, sensor in found.items():
         _check_sensor(name, sensor)
+    return found
+
+
+def _find(name: str) -> Sensor:
+    """Find a sensor by its name."""
+    if name not in SENSORS:
+        raise ValueError(
+            f"sensors must be names in SENSORS, {sorted(SENSORS)}, {got(name, SENSORS)}: "
+            "register it first, in scripts by a plugin"
+        )
+    return SENSORS[name]
+
+
+def _find_described(name: str, facts: Mapping[str, Any]) -> Sensor:
+    """Make a second lidar as described, or find another sensor, which must be as described."""
+    if facts.get("kind") == LidarSensor.__name__:
+        given = {entry.name: facts[entry.name] for entry in fields(LidarSensor) if entry.init}
+        return LidarSensor(**given)
+    found = _find(name)
+    present = (describe_sensors({name: found}) or {})[name]
+    for entry in {*facts, *present}:
+        if facts.get(entry) != present.get(entry):
+            raise ValueError(
+                f"sensors[{name!r}].{entry} must be {facts.get(entry)!r}, as when the policy "
+                f"learned, got {present.get(entry)!r}"
+            )
     return found
 
 
@@ -231,3 +262,16 @@ def write_sensed(
             )
         observations[sight.chosen, first : first + sensor.width] = seen
         first += sensor.width
+
+
+def sense_with(
+    sensors: Mapping[str, Sensor], index: int, sight: Sight, name: str
+) -> NDArray[np.float32]:
+    """Sense with one robot's sensor, by name; return its values, ``[width]``."""
+    if name not in sensors:
+        raise ValueError(f"name must be one of {sorted(sensors)}, {got(name, sensors)}")
+    sensor, chosen = sensors[name], np.arange(len(sight.motions)) == index
+    values = np.empty((len(chosen), sensor.width), np.float32)
+    alone = sight._replace(motions=sight.motions.copy(), chosen=chosen)
+    write_sensed({name: sensor}, alone, values)
+    return values[index]

@@ -9,9 +9,13 @@ import inspect
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mpfa_envs.checks import check_number, got
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
@@ -21,8 +25,16 @@ far away, and a critic that is a little too smooth would rather circle than arri
 """
 
 
+def _no_sensors(name: str) -> NDArray[np.floating[Any]]:
+    """Reject what an outcome that no robot had is asked for."""
+    raise ValueError(f"name must be that of a sensor of the task, got {name!r}")
+
+
 class StepOutcome(NamedTuple):
-    """Results of one step, the argument of a reward function."""
+    """Results of one time step, the argument of a reward function.
+
+    An action has ``action_repeat`` time steps, two by default, whose rewards add up.
+    """
 
     previous_distance: float
     """Distance to the goal before the step, straight or as ``progress`` measures it [m]."""
@@ -38,6 +50,9 @@ class StepOutcome(NamedTuple):
     """Forward speed after the step [m/s]."""
     angular_speed: float
     """Turning speed after the step, to the left [rad/s]."""
+    sense: Callable[[str], NDArray[np.floating[Any]]] = _no_sensors
+    """Senses after the step with a further sensor of the robot, by name; gives its values,
+    ``[width]``."""
 
 
 class RewardTerms(NamedTuple):
@@ -124,7 +139,7 @@ def named_reward(name: str) -> RewardFunction:
     if name not in REWARDS:
         raise ValueError(
             f"reward must be callable, None or a name in REWARDS, {sorted(REWARDS)}, "
-            f"{got(name, REWARDS)}"
+            f"{got(name, REWARDS)}: register it first, in scripts by a plugin"
         )
     return REWARDS[name]
 

@@ -191,7 +191,11 @@ def _check_plugin(state: dict[str, Any], overrides: list[Override]) -> None:
     if had is not None and not given:
         raise ValueError(f"resume: the run was made with a plugin: add plugin={had}")
     if given and files.digest_of(given[-1]) != before:
-        print("warning: it is another plugin than when the run was saved", file=sys.stderr)
+        print(
+            "warning: the plugin has changed since the run was saved: if its rewards, methods or "
+            "sensors differ, what is in the buffer is of the former ones",
+            file=sys.stderr,
+        )
 
 
 def prepare_process(settings: TrainSettings) -> None:

@@ -70,6 +70,12 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
 def _lengthened(stages: Sequence[Stage], actions: int) -> list[Stage]:
     """Return stages of so many actions in all, of which the last stage has what is left."""
     *fixed, last = stages
+    so_far = sum(each.actions for each in stages)
+    if last.actions and actions < so_far:
+        raise ValueError(
+            f"resume: actions must be at least the {so_far} of the run, got {actions}: leave it "
+            "out, or give more"
+        )
     if not last.actions:
         raise ValueError(
             "resume: actions must be null in a run that counts episodes, got "

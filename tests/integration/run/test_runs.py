@@ -192,8 +192,11 @@ def test_the_actions_of_a_resumed_run_lengthen_its_last_stage(tmp_path: Path) ->
     found = json.loads((tmp_path / files.SETTINGS).read_text())["curriculum"]["stages"]
     assert [(stage["world"], stage["actions"]) for stage in found] == [("A", 15), ("B", 30)]
     assert json.loads((tmp_path / files.STATUS).read_text())["steps"] == 45
-    with pytest.raises(Rejected, match=r"has \[A: 15, B: 30\], got \[A: 15, B: 25\]"):
+    with pytest.raises(Rejected, match="actions must be at least the 45 of the run, got 40"):
         go_on(tmp_path, "actions=40")
+    shorter = "curriculum.stages=[{world: A, actions: 15}, {world: B, actions: 25}]"
+    with pytest.raises(Rejected, match=r"has \[A: 15, B: 30\], got \[A: 15, B: 25\]"):
+        go_on(tmp_path, shorter)
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
