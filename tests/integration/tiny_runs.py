@@ -68,7 +68,7 @@ def tiny(
 def blocky(block: int, method: str = "rud") -> TrainSettings:
     """Three robots, whose updates come in blocks after so many actions."""
     settings = tiny(method, [Stage("A", actions=120)], robots=3, updates=2)
-    settings.method.batch_size, settings.method.update_block = 16, block
+    settings.method.batch_size, settings.method.update_block = 18, block
     return settings
 
 
