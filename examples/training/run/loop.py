@@ -84,7 +84,7 @@ class TrainingRun:
         self._build()
         self.updates = 0
         self.waiting = 0
-        """Actions whose updates are still to be made."""
+        """Iterations whose updates are still to be made."""
         self._events: list[tuple[Any, ...]] = []
         """Events of the iteration that hooks still have to get."""
         self.records: list[EpisodeRecord] = []
@@ -182,7 +182,7 @@ class TrainingRun:
         self._before, self._events = self.actions, []
         records = self._collect()
         if len(self.buffer) >= (self.buffer.batch_size or 0):
-            self.waiting += self.settings.robots
+            self.waiting += 1
             self._update()
         if self.crossed(self.settings.tracking.log_every):
             self.log.add(self.actions, episode=self.schedule.episodes, buffer=self.buffer)
@@ -216,14 +216,14 @@ class TrainingRun:
 
     def _update(self) -> None:
         """The updates that are due, of a block of actions together."""
-        due, left = divmod(self.waiting, self.settings.robots)
-        if not due or not self.crossed(self.settings.method.update_block):
+        if not self.crossed(self.settings.method.update_block):
             return
-        every, begun = self.settings.tracking.log_every, self.actions - self.waiting
+        every = self.settings.tracking.log_every
+        begun = self.actions - self.waiting * self.settings.robots
         if self._to_compile:
             self._to_compile = False
             tqdm.write("compiling the update, some 20 s, or a few if that was done before")
-        for _ in range(due):
+        for _ in range(self.waiting):
             losses, batch = run_updates(
                 self.buffer,
                 self.learner,
@@ -232,7 +232,7 @@ class TrainingRun:
                 prepare=self._prepared,
             )
             self.updates += self.settings.updates
-        self.waiting = left
+        self.waiting = 0
         self.log.learned(losses)
         if every > 0 and begun // every != self.actions // every:
             self._events.append(("on_update", {**losses, **self._bonus}, batch))
@@ -314,8 +314,7 @@ class TrainingRun:
             "wandb": self.tracker.run_id,
             "schedule": self.schedule.state_dict(),
             "updates": self.updates,
-            "waiting": self.waiting // self.settings.robots,
-            "waiting_actions": self.waiting % self.settings.robots,
+            "waiting": self.waiting,
             "random": random_state(self.settings.device),
             "robots": self.robots.state_dict(),
             "learner": self.learner.state_dict(),
@@ -334,8 +333,7 @@ class TrainingRun:
         """Load a state of :meth:`state_dict`."""
         self.schedule.load_state_dict(state["schedule"])
         self.updates = state["updates"]
-        self.waiting = state["waiting"] * self.settings.robots
-        self.waiting += state["waiting_actions"]
+        self.waiting = state["waiting"]
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
         self.explorer.load_state_dict(state["explorer"])

@@ -54,6 +54,23 @@ def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -
     assert not (tmp_path / "plain" / "evaluations.csv").exists()
 
 
+def test_the_clock_of_a_run_stands_during_evaluations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate_policy = loop.evaluate_policy
+
+    def slowly(*arguments: Any, **named: Any) -> Any:
+        found, driven = evaluate_policy(*arguments, **named)
+        return replace(found, seconds=1000.0), driven
+
+    monkeypatch.setattr(loop, "evaluate_policy", slowly)
+    settings = tiny()
+    settings.evaluation.every, settings.evaluation.episodes = 40, 1
+    run = train(tmp_path, settings)
+    assert run.robots.elapsed() == pytest.approx(-1000.0 * len(run.evaluations), abs=200.0)
+    assert run.evaluations
+
+
 def of_robots(physics: str) -> TrainSettings:
     settings = tiny(episodes=[Stage("bars", actions=90)], robots=3, updates=2)
     settings.environment.physics, settings.environment.progress = physics, "shortest_path"
@@ -138,6 +155,14 @@ def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     run = train(tmp_path / "learned", learned)
     assert max(abs(record.reward) for record in run.records) < 1e3
     assert run.buffer[:]["next", "reward"].abs().max() < 1e3
+
+
+def test_a_learner_hears_of_each_episode_that_ends(tmp_path: Path) -> None:
+    run, heard = TrainingRun(tiny(), tmp_path), []
+    run.learner.end_episode = lambda: heard.append(len(run.records))  # type: ignore[method-assign]
+    run.train()
+    run.close()
+    assert heard == list(range(1, 7))
 
 
 def test_a_curriculum_that_does_not_carry_begins_again_in_each_world(tmp_path: Path) -> None:

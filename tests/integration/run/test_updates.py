@@ -21,8 +21,10 @@ from tests.integration.tiny_runs import (
 )
 from torchrl_mpfa.selection import SampledBatch
 from training.records import read_table
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.run.updates import COLUMNS, UpdateLog
+from training.settings.train import Stage
 
 
 def of_run(folder: Path) -> pd.DataFrame:
@@ -169,6 +171,32 @@ def test_updates_come_in_blocks_and_are_as_many_as_without(tmp_path: Path) -> No
         last = actions // 30 * 30
         assert updates == (plain[last] if last else 0), actions
     assert blocks[120] == plain[120] == 2 * (120 - 15) // 3
+
+
+def test_updates_that_wait_are_dropped_with_the_parts_that_they_were_for(tmp_path: Path) -> None:
+    settings = blocky(30)
+    settings.curriculum.stages = [Stage("A", actions=45), Stage("B", actions=45)]
+    settings.curriculum.carry = False
+    run = train(tmp_path, settings)
+    # Batches of 18 are there after six actions of three robots, in each stage.
+    assert run.updates == 2 * ((30 - 15) // 3 + (45 - 15) // 3)
+
+
+def test_updates_of_a_block_are_told_of_if_one_of_its_actions_is_to_be_logged(
+    tmp_path: Path,
+) -> None:
+    told: list[int] = []
+
+    class Told(Hook):
+        def on_update(self, run: TrainingRun, losses: Any, batch: Any) -> None:
+            told.append(run.actions)
+
+    settings = blocky(30)
+    settings.tracking.log_every = 20
+    run = TrainingRun(settings, tmp_path, hooks=[Told()])
+    run.train()
+    run.close()
+    assert told == [30, 60, 90, 120]
 
 
 def test_the_policy_stays_as_it_is_within_a_block(tmp_path: Path) -> None:
