@@ -15,6 +15,8 @@ from typing import NoReturn
 
 from filelock import FileLock, Timeout
 
+from training.extra import end_with
+
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
 SETTINGS = "settings.json"
@@ -131,7 +133,9 @@ def run_script(main: Callable[[], object]) -> NoReturn:
         with suppress(OSError):  # Where errors go may be on the disk that is full.
             print(f"{Path(sys.argv[0]).name}: {cause}, {AGAIN}", file=sys.stderr)
         raise SystemExit(1) from error
-    sys.exit(status if isinstance(status, int) else 0)
+    status = status if isinstance(status, int) else 0
+    end_with(status)
+    sys.exit(status)
 
 
 def _report_thread(ended: threading.ExceptHookArgs) -> None:
