@@ -32,14 +32,14 @@ if _missing:
     )
 
 
-# Imports make 600,000 objects that stay. By default they are searched through again and again, which
-# takes a fifth of the imports' time.
+# Imports make 600,000 objects that stay. By default they are searched through again and again,
+# which takes a fifth of the imports' time.
 gc.set_threshold(100_000, 50, 50)
 _status: list[int] = []
 
 
 def end_with(status: int) -> None:
-    """Have the process end with a status, as soon as all that was registered for its end is done."""
+    """Have the process end with a status once all that was registered for its end is done."""
     _status.append(status)
 
 

@@ -347,14 +347,10 @@ class TrainingRun:
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
         self.log.load_state_dict(state["log"])
         set_random_state(self.settings.device, state["random"])
-        self._resume(state["robots"], state["random"])
-
-    def _resume(self, robots: dict[str, Any], random: Any) -> None:
-        """Restore the robots, or begin the next stage if it is due."""
-        self.robots.recall(robots)
+        self.robots.recall(state["robots"])
         if not self._advance():
-            self.robots.load_state_dict(self.schedule.world, robots)
-            set_random_state(self.settings.device, random)
+            self.robots.load_state_dict(self.schedule.world, state["robots"])
+        # A run that has become longer is less far.
         self._anneal()
 
     def close(self) -> None:

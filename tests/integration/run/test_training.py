@@ -90,8 +90,11 @@ RESUMED = {
 }
 
 
-KEPT = ("mpfa_per-ddpg", "mpfa_per-sac", "mpfa_per-dqn", "la3p-td3", "robots-kinematic")
-"""Cases that are not slow: a learner of each kind, and several robots."""
+KEPT = (
+    *("mpfa_per-ddpg", "mpfa_per-sac", "mpfa_per-dqn", "la3p-td3"),
+    *("ddpg_radam-ddpg", "robots-kinematic"),
+)
+"""Cases that are not slow: a learner of each kind, a bonus, and several robots."""
 
 
 @pytest.mark.parametrize("case", mostly_slow(RESUMED, (*KEPT, "ref_er-blocks")))
@@ -103,6 +106,19 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path,
     assert all(record.total_steps <= actions for record in part.records)
     assert len(whole.records) > len(part.records)
     assert_same_run(go_on(tmp_path, settings), whole)
+
+
+def test_a_run_that_was_lengthened_goes_on_with_the_rates_of_its_new_length(
+    tmp_path: Path,
+) -> None:
+    short, long = (tiny("per", [Stage("A", actions=actions)]) for actions in (40, 400))
+    for settings in (short, long):
+        settings.learner.lr_end_factor = 0.1
+    train(tmp_path, short)
+    run = TrainingRun(long, tmp_path, read_checkpoint(tmp_path))
+    rates = [group["lr"] for group in run.learner.optimizer.param_groups]  # type: ignore[attr-defined]
+    run.close()
+    assert rates == pytest.approx([0.91 * short.learner.actor_lr, 0.91 * short.learner.critic_lr])
 
 
 ACTORS = ("ddpg", "sac", "td3")
