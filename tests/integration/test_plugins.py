@@ -26,6 +26,7 @@ from training.settings.command_line import composed, known_settings
 from training.settings.train import register
 
 MINE = """
+import torch
 from torch import nn
 from mpfa_envs import ROBOTS, Cylinder, World, register_generator
 from torchrl_mpfa.methods import METHODS, Scaled, register_signal
@@ -35,6 +36,7 @@ class Size(nn.Module):
         super().__init__()
         self.factor = nn.Parameter(torch.rand(1))
     def forward(self, learner, batch):
+        self.factor.data *= 1.01  # It learns.
         return (self.factor * batch["observation"].norm(dim=-1)).detach()
 
 def pillars(source, difficulty):
@@ -45,7 +47,7 @@ register_signal("size", Size)
 register_generator("pillars", pillars)
 METHODS["mine"] = Scaled("mine", signals=["td_error", "size"])
 ROBOTS["cart"] = ROBOTS["turtlebot2"]
-""".replace("from torch import nn", "import torch\nfrom torch import nn")
+"""
 
 
 @pytest.fixture
