@@ -29,6 +29,7 @@ from torch._inductor import config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 from torchrl_mpfa.caches import own_cache_folder
 from torchrl_mpfa.learners.adam import FlatAdam, FlatGroup
@@ -268,20 +269,36 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
     # three seconds at the start, and would take a tenth of an update.
     # Imported here, as it takes a second and many learners are not compiled.
     from torch._inductor.compile_fx import compile_fx_inner
+    from torch._inductor.cpu_vec_isa import valid_vec_isa_list
     from torch._inductor.decomposition import select_decomp_table
 
-    mode = FakeTensorMode()
+    # With an environment of shapes, as Inductor's cache of graphs asks for one.
+    mode = FakeTensorMode(shape_env=ShapeEnv())
     on_cpu = all(value.device.type == "cpu" for value in inputs)
     # Random numbers are those that the losses would have.
     patches = {"fallback_random": True, "cpp_wrapper": on_cpu, **arguments.get("options", {})}
     context = torch._guards.TracingContext(mode)
-    with torch.no_grad(), config.patch(patches), torch._guards.tracing(context):
-        fakes = [mode.from_tensor(value.detach(), static_shapes=True) for value in inputs]
-        functional = torch.func.functionalize(lambda *values: module(*values))
-        with mode:
-            graph = make_fx(functional, decomposition_table=select_decomp_table())(*fakes)
-        compiled: Any = compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
-    call = compiled.current_callable
+
+    def compiled(patches: dict[str, Any]) -> Any:
+        with torch.no_grad(), config.patch(patches), torch._guards.tracing(context):
+            fakes = [mode.from_tensor(value.detach(), static_shapes=True) for value in inputs]
+            functional = torch.func.functionalize(lambda *values: module(*values))
+            with mode:
+                graph = make_fx(functional, decomposition_table=select_decomp_table())(*fakes)
+            return compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
+
+    # To try each vector instruction set of the processor takes three times as long as the program.
+    tried = {"cpp.vec_isa_ok": True, **patches}
+    try:
+        call = compiled(tried).current_callable
+    except Exception:
+        if not on_cpu or "cpp.vec_isa_ok" in patches:
+            raise
+        # An old compiler may not have the newest of them.
+        call = compiled(patches).current_callable
+    finally:
+        # Others may want them tried.
+        valid_vec_isa_list.cache_clear()
     return lambda *values: call([*values])
 
 

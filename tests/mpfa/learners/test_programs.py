@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch._dynamo.utils import counters
 from torch._inductor import compile_fx, config
 from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -161,7 +162,8 @@ def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_
     asked = []
 
     def compile(module, inputs, **_):
-        asked.append((torch.is_grad_enabled(), config.fallback_random))
+        cached = inputs[0].fake_mode.shape_env is not None
+        asked.append((torch.is_grad_enabled(), config.fallback_random, cached))
         return SimpleNamespace(current_callable=lambda values: module.forward(*values))
 
     monkeypatch.setattr(program, "_COMPILED", {})
@@ -169,8 +171,43 @@ def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_
     learners = make_pair("td3", True, policy_delay=1)
     for seed in range(3):
         update_both(learners, seed)
-    assert asked == [(False, True)]
+    assert asked == [(False, True, True)]
     assert_alike(*learners)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_vector_instructions_are_tried_only_where_a_program_cannot_be_made_with_them(
+    monkeypatch, broken
+):
+    asked = []
+
+    def compile(module, inputs, **_):
+        asked.append(config.cpp.vec_isa_ok)
+        if broken or config.cpp.vec_isa_ok:
+            raise OSError("no such instructions")
+        return SimpleNamespace(current_callable=lambda values: module.forward(*values))
+
+    monkeypatch.setattr(program, "_COMPILED", {})
+    monkeypatch.setattr(compile_fx, "compile_fx_inner", compile)
+    learners = make_pair("ddpg", True)
+    if broken:
+        with pytest.raises(OSError, match="no such instructions"):
+            update_both(learners, 0)
+    else:
+        update_both(learners, 0)
+        assert_alike(*learners)
+    assert asked == [True, None]
+
+
+@pytest.mark.slow
+def test_a_graph_that_was_compiled_is_read_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    hits = counters["inductor"]
+    for hit in (0, 1):
+        monkeypatch.setattr(program, "_COMPILED", {})
+        before = hits["fxgraph_cache_hit"]
+        update_both(make_pair("ddpg", True), 0)
+        assert hits["fxgraph_cache_hit"] - before == hit
 
 
 # Updates of a round, made by the program at once.
