@@ -14,6 +14,7 @@ import pytest
 import torch
 from torchrl.data import RandomSampler
 
+import torchrl_mpfa as mpfa
 from mpfa_envs import load_policy
 from tests.integration.tiny_runs import (
     assert_same_run,
@@ -34,6 +35,7 @@ from training.records import EvaluationRecord
 from training.run import loop
 from training.run.checkpoints import random_state, read_checkpoint, set_random_state
 from training.run.driving import Robots
+from training.run.evaluations import exported_policy, kept_policy
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.train import GROUPS, Stage, TrainSettings
@@ -333,6 +335,24 @@ def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for
     np.testing.assert_allclose(
         load_policy(tmp_path)(observation), expected.detach().numpy(), atol=1e-5
     )
+    run.settings.evaluation.choose = False
+    assert kept_policy(run).card["steps"] == run.actions != chosen.total_steps
+
+
+@pytest.mark.parametrize(("share", "needed"), [(1.0, True), (0.5, False), (0.0, False)])
+def test_a_policy_needs_the_filter_if_all_robots_had_it(share: float, needed: bool) -> None:
+    settings = tiny()
+    settings.environment.robot, settings.environment.filter = "kobuki", share
+    policy = mpfa.make_actor(24, 2, width=8)
+    assert exported_policy(policy, settings).card["filter"] is needed
+
+
+def test_a_run_that_is_closed_has_no_simulation_left(tmp_path: Path) -> None:
+    run, ended = TrainingRun(tiny(), tmp_path), []
+    close = run.robots.close
+    run.robots.close = lambda: (ended.append(True), close())  # type: ignore[method-assign]
+    run.close()
+    assert ended
 
 
 def test_rates_fall_linearly_in_long_runs_and_with_the_cube_in_short_ones(tmp_path: Path) -> None:

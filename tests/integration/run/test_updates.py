@@ -182,6 +182,27 @@ def test_updates_that_wait_are_dropped_with_the_parts_that_they_were_for(tmp_pat
     assert run.updates == 2 * ((30 - 15) // 3 + (45 - 15) // 3)
 
 
+def test_rows_of_a_stage_that_begins_anew_are_of_its_own_buffer(tmp_path: Path) -> None:
+    settings = blocky(1)
+    settings.curriculum.stages = [Stage("A", actions=45), Stage("B", actions=45)]
+    settings.curriculum.carry, settings.tracking.log_every = False, 16
+    train(tmp_path, settings)
+    found = of_run(tmp_path).set_index("total_steps")
+    # The second stage begins after 45 actions, and learns from the 63rd on.
+    missing = {18: False, 33: False, 48: True, 66: False, 81: False}
+    assert found["td_error"].isna().to_dict() == missing
+    assert found["positive_batch"].isna()[48]
+
+
+def test_each_batch_of_a_round_counts_by_itself(tmp_path: Path) -> None:
+    run, seen = TrainingRun(tiny(updates=3), tmp_path), []
+    learns = run.log.learns
+    run.log.learns = lambda index: (seen.append(len(index)), learns(index))  # type: ignore[method-assign]
+    run.train()
+    run.close()
+    assert seen == [8] * run.updates
+
+
 def test_updates_of_a_block_are_told_of_if_one_of_its_actions_is_to_be_logged(
     tmp_path: Path,
 ) -> None:
