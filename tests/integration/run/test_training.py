@@ -347,6 +347,17 @@ def test_a_policy_needs_the_filter_if_all_robots_had_it(share: float, needed: bo
     assert exported_policy(policy, settings).card["filter"] is needed
 
 
+def test_logs_are_written_before_the_checkpoint_that_does_not_make_them_again(
+    tmp_path: Path,
+) -> None:
+    run, there = TrainingRun(tiny(), tmp_path), []
+    checkpoint = tmp_path / CHECKPOINT
+    run.tracker.flush = lambda: there.append(checkpoint.exists())  # type: ignore[method-assign]
+    run.save()
+    run.close()
+    assert there == [False] and checkpoint.exists()
+
+
 def test_a_run_that_is_closed_has_no_simulation_left(tmp_path: Path) -> None:
     run, ended = TrainingRun(tiny(), tmp_path), []
     close = run.robots.close
