@@ -10,7 +10,7 @@
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
 #   DEMO_ACTIONS=30000             length of demo's training, in actions
-#   EPISODES=50                    evaluation episodes of demo in the worlds of each generator
+#   EPISODES=20                    evaluation episodes of demo in the worlds of each generator
 #   SLOW=1                         test: include the slow tests
 #   WORKERS=4                      test: number of processes, 2 by default; 0: one, with live output
 
@@ -24,7 +24,7 @@ TORCH_INSTALL_ARGS ?=
 ARGS ?=
 REGIME ?= rooms
 DEMO_ACTIONS ?= 30000
-EPISODES ?= 50
+EPISODES ?= 20
 SLOW ?=
 WORKERS ?= 2
 

@@ -96,7 +96,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
                 "tracking=off actions=30000",
-                "python examples/evaluate.py runs/demo --worlds all --episodes 50",
+                "python examples/evaluate.py runs/demo --worlds all --episodes 20",
                 "cd runs/demo/evaluation-all-",
                 "cp evaluation.json trajectories.png episode.gif ..",
             ],
