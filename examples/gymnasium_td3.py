@@ -7,8 +7,8 @@
     python examples/report.py runs/td3                          tables of all runs, and their curves
 
 MuJoCo's tasks need the extra ``mujoco``, those of gymnasium-robotics the extra ``robotics``.
-Batches of 100 and rates of 0.001 are those of TD3's paper; networks have 2 x 256 units, and the
-first 5,000 steps are at random. ``scores.csv`` in the folder of a run has the mean return of ten
+Batches of 100, rates of 0.001 and the form of the networks are those of TD3's paper; layers have 256
+units, and the first 5,000 steps are at random. ``scores.csv`` in the folder of a run has the mean return of ten
 episodes without noise, or of goal tasks the share of episodes that end at their goal. The file is
 written at the end: a run that was stopped begins again.
 
@@ -232,11 +232,12 @@ def train(options: argparse.Namespace, task: Task) -> list[list[object]]:
         relabel = GymnasiumGoals(task.compute_reward)
         replay.buffer.append_transform(HindsightGoals(relabel, goals=method.hindsight))
     kept = ["observation", "action", "next", *replay.entries]
-    sizes: dict[str, Any] = {"width": options.width, "layer_norm": False}
-    actor = mpfa.make_actor(task.observations, task.actions, **sizes)
+    # Networks as TD3's authors have them; the defaults are DDPG's.
+    form: dict[str, Any] = {"width": options.width, "layer_norm": False, "final_init": None}
+    actor = mpfa.make_actor(task.observations, task.actions, **form)
     learner = mpfa.ActorCritic(
         actor,
-        mpfa.make_critic(task.observations, task.actions, **sizes),
+        mpfa.make_critic(task.observations, task.actions, late_action=False, **form),
         gamma=options.gamma,
         tau=options.tau,
         policy_noise=0.2,
@@ -245,6 +246,7 @@ def train(options: argparse.Namespace, task: Task) -> list[list[object]]:
         policy_delay=2,
         actor_lr=LEARNING_RATE,
         critic_lr=LEARNING_RATE,
+        critic_weight_decay=0.0,
         compile=not options.eager,
         **loss_options(method),
     )
