@@ -60,11 +60,12 @@ help: ## Print this list
 
 demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unseen rooms
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off actions=$(DEMO_ACTIONS) $(ARGS)
-	@echo "== driving through test worlds of every generator"
-	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED) --filter
+	@$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off actions=$(DEMO_ACTIONS) $(ARGS)
+	@echo "== driving $(EPISODES) tasks in unseen worlds of each generator, a minute"
+	@$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED) --filter
 	@cd runs/demo/evaluation-all-$(EVALUATED)-filter && cp evaluation.json trajectories.png episode.gif ..
-	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
+	@echo "look at runs/demo/trajectories.png, and at runs/demo/episode.gif, the longest of these drives"
+	@echo "next: $(BIN)/python examples/play.py runs/demo --worlds mazes:test    a race against it by keyboard"
 
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
 	$(BIN)/python examples/train.py regime=$(REGIME) $(PHYSICS) $(ARGS)

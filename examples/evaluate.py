@@ -415,6 +415,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             for world, drives in zip(options.names, driven, strict=True)
         ]
         if not options.no_pictures:
+            print("drawing the paths and the longest drive", file=sys.stderr)
             write_pictures(driver, driven, folder, values=critic(options), **asked.arguments)
         if len(rows) > 1:
             rows.append({"world": "total", "physics": asked.physics, **summary_row(results)})

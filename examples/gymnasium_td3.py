@@ -7,10 +7,10 @@
     python examples/report.py runs/td3                          tables of all runs, and their curves
 
 MuJoCo's tasks need the extra ``mujoco``, those of gymnasium-robotics the extra ``robotics``.
-Batches of 100, rates of 0.001 and the form of the networks are those of TD3's paper; layers have 256
-units, and the first 5,000 steps are at random. ``scores.csv`` in the folder of a run has the mean return of ten
-episodes without noise, or of goal tasks the share of episodes that end at their goal. The file is
-written at the end: a run that was stopped begins again.
+Batches of 100, rates of 0.001 and the form of the networks are those of TD3's paper; layers have
+256 units, and the first 5,000 steps are at random. ``scores.csv`` in the folder of a run has the
+mean return of ten episodes without noise, or of goal tasks the share of episodes that end at their
+goal. The file is written at the end: a run that was stopped begins again.
 
 A goal task has observations with ``achieved_goal`` and ``desired_goal``, and pays by
 ``compute_reward``. Networks read the goal as a part of the observation, whose numbers are

@@ -160,6 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         window = Window("arrows or WASD: drive   N: next room   Esc: end", fps=options.speed / step)
     except (ValueError, OSError, DependencyNotInstalled) as error:
         parser.error(str(error))
+    if window.is_hidden():
+        parser.error("there is no screen to show a window on: evaluate.py writes pictures")
     score = {"you": 0, "policy": 0, "nobody": 0}
     with closing(window):
         for task in tasks[: options.races]:

@@ -127,3 +127,15 @@ def test_the_evaluation_is_shown_live_and_writes_nothing(
     assert len(shown) == 1
     assert "A: timeout after 4.0 s" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
+
+
+def test_without_a_screen_nobody_races(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pygame.display.quit()
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
+    with pytest.raises(SystemExit) as ended:
+        play.main([])
+    assert ended.value.code == 2
+    assert "there is no screen" in capsys.readouterr().err

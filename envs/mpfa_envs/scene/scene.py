@@ -120,6 +120,12 @@ class Window:
         self.closed = False
         """Set once the user has closed it or pressed Escape; it shows nothing more then."""
 
+    def is_hidden(self) -> bool:
+        """Return True if there is no screen, and nobody asked for a window without one."""
+        self._pygame.display.init()
+        hidden = self._pygame.display.get_driver() in ("offscreen", "dummy")
+        return hidden and "SDL_VIDEODRIVER" not in os.environ
+
     def show(self, picture: NDArray[np.uint8]) -> bool:
         """Show a picture, ``[height, width, 3]``, when due; return True if the window is open."""
         if self.closed:

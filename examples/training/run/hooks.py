@@ -93,6 +93,7 @@ class Progress(Hook):
 
     def __init__(self) -> None:
         self._bar: tqdm[Any] | None = None
+        self._learned = False
         self._reported = 0.0
         self._line = time.monotonic()
 
@@ -107,6 +108,11 @@ class Progress(Hook):
         """Move the bar, and report the success and the speed once a second."""
         assert self._bar is not None
         self._bar.update(run.schedule.done - self._bar.n)
+        if run.updates and not self._learned:
+            # From here on: the time left is not that of what the first update compiles.
+            self._learned, self._bar.initial = True, self._bar.n
+            self._bar.reset()
+            self._bar.n = self._bar.last_print_n = self._bar.initial
         if time.monotonic() - self._reported > _REPORT_EVERY:
             self._reported = time.monotonic()
             self._show(run, report(run))
