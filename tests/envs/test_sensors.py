@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -243,3 +243,17 @@ def test_a_reward_senses_after_each_time_step() -> None:
         other.step(np.ones((1, 2), np.float32))
     with pytest.raises(ValueError, match="that of a sensor of the task, got 'rear'"):
         StepOutcome(2.0, 1.9, False, False, 1.0, 0.4, 0.0).sense("rear")
+
+
+def test_rays_of_a_second_lidar_are_noisy_and_drop_out_from_each_robots_own_source() -> None:
+    noisy, deaf = replace(REAR, noise=0.2), replace(REAR, dropout=1.0)
+
+    def seen(sensor: LidarSensor, robots: int) -> NDArray[np.float32]:
+        env = VectorNavigationEnv(robots, world="D", sensors={"rear": sensor}, **TASK)
+        return env.reset(seed=[1, 2][:robots])[0][:, env.config.observation_slices["rear"]]
+
+    plain, disturbed = seen(REAR, 2), seen(noisy, 2)
+    off = np.abs(0.25 / disturbed - 0.25 / plain)
+    assert 0.0 < off.max() < 1.5
+    np.testing.assert_array_equal(disturbed[:1], seen(noisy, 1))
+    np.testing.assert_allclose(seen(deaf, 1), 0.25 / REAR.max_range)

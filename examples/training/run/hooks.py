@@ -101,7 +101,7 @@ class Progress(Hook):
         """Show the bar."""
         done = run.schedule
         self._bar = tqdm(
-            total=done.total, initial=done.done, unit=done.unit, smoothing=0.05, disable=None
+            total=done.total, initial=done.done, unit=done.unit, smoothing=0, disable=None
         )
 
     def on_iteration(self, run: TrainingRun) -> None:
@@ -111,8 +111,7 @@ class Progress(Hook):
         if run.updates and not self._learned:
             # From here on: the time left is not that of what the first update compiles.
             self._learned, self._bar.initial = True, self._bar.n
-            self._bar.reset()
-            self._bar.n = self._bar.last_print_n = self._bar.initial
+            self._bar.start_t = time.time()
         if time.monotonic() - self._reported > _REPORT_EVERY:
             self._reported = time.monotonic()
             self._show(run, report(run))

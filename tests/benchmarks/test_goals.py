@@ -1,0 +1,90 @@
+"""Runs on goal tasks: which are made, what is kept, and what the planned table compares."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from benchmarks import goals
+from training.comparison.scores import COLUMNS
+from training.records import read_table, write_table
+
+TASKS = list(goals.STEPS)[:2]
+
+
+def rows_of(task: str, arm: str, seed: int, height: float) -> pd.DataFrame:
+    found = {"task": task, "method": arm, "seed": seed, "steps": [10, 20], "score": height}
+    return pd.DataFrame(found)[list(COLUMNS)]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, int]]:
+    """The runs that were asked for, in place of runs."""
+    asked: list[tuple[str, str, int]] = []
+
+    def run(task: str, arm: str, seed: int, *_: Any) -> pd.DataFrame:
+        asked.append((task, arm, seed))
+        return rows_of(task, arm, seed, 0.5)
+
+    monkeypatch.setattr(goals, "run", run)
+    monkeypatch.setattr(goals, "CHOSEN", {task: {} for task in TASKS})
+    return asked
+
+
+def test_each_run_is_made_once_and_its_rows_are_kept(
+    made: list[tuple[str, str, int]], tmp_path: Path
+) -> None:
+    kept = tmp_path / "goals.csv"
+    goals.make(TASKS, [104, 105], tmp_path, kept)
+    arms = {arm for task, arm, seed in made if (task, seed) == (TASKS[0], 104)}
+    assert arms == {*goals.ARMS, goals.SB3}
+    # Stable-Baselines3 has five seeds.
+    assert {arm for task, arm, seed in made if seed == 105} == {*goals.ARMS}
+    assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
+    goals.make(TASKS, [104, 105, 106], tmp_path, kept)
+    assert {seed for *_, seed in made[22:]} == {106}
+
+
+def test_candidates_of_the_search_are_ordered_by_their_mean_area(
+    made: list[tuple[str, str, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(task: str, arm: str, seed: int, settings: Any, *_: Any) -> pd.DataFrame:
+        assert arm == "HER" and seed in goals.SEARCH_SEEDS
+        return rows_of(task, arm, seed, settings["gamma"] - settings["tau"])
+
+    monkeypatch.setattr(goals, "run", run)
+    said = goals.search(TASKS[:1], tmp_path, tmp_path / "search.csv").splitlines()
+    assert len(said) == len(goals.CANDIDATES)
+    assert said[0].startswith(f"{TASKS[0]}: gamma=0.98 tau=0.005")
+    assert "gamma=0.95 tau=0.05" in said[-1]
+
+
+def test_planned_differences_are_of_the_means_over_the_tasks(tmp_path: Path) -> None:
+    heights = dict(zip(goals.ARMS, (0.1, 0.6, 0.8, 0.7, 0.65), strict=True))
+    rows = [
+        rows_of(task, arm, seed, height * factor + 0.001 * seed)
+        for task, factor in zip(TASKS, (1.0, 0.5), strict=True)
+        for arm, height in heights.items()
+        for seed in range(8)
+    ]
+    write_table(pd.concat(rows), tmp_path / "goals.csv")
+    table = goals.tables(tmp_path / "goals.csv").split("\n\n")[0].splitlines()[2:]
+    # Three quarters of a score is the area of two equal ones that begin at zero.
+    expected = (("PER with hindsight − HER", 0.2), ("MPFA-PER with hindsight − PER", -0.1))
+    for line, (name, gap) in zip(table, expected, strict=False):
+        assert line.startswith(f"| {name}")
+        assert float(line.split("|")[3]) == pytest.approx(0.75 * 0.75 * gap, abs=0.002)
+    assert len(table) == 4
+
+
+def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
+    pytest.importorskip("gymnasium_robotics", reason="goal tasks are of the extra robotics")
+    for arm, own in goals.ARMS.items():
+        words = goals.words_of("FetchReach-v4", 3, {"gamma": 0.95, "tau": 0.05, "noise": 0.1})
+        options, task = goals.page.parse([*words, *own])
+        task.env.close()
+        assert (options.steps, options.every, options.width, options.seed) == (10_000, 500, 64, 3)
+        assert (options.hindsight is None) == (arm in ("uniform", "HER"))
