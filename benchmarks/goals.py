@@ -40,7 +40,7 @@ ARMS: Final[Mapping[str, Sequence[str]]] = {
 }
 """What an arm says beside the settings of the task."""
 STEPS: Final[Mapping[str, int]] = {
-    "FetchReach-v4": 10_000,
+    "FetchReach-v4": 5_000,
     "PointMaze_UMaze-v3": 30_000,
     "PointMaze_Medium-v3": 60_000,
     "FetchPush-v4": 100_000,

@@ -86,5 +86,5 @@ def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
         words = goals.words_of("FetchReach-v4", 3, {"gamma": 0.95, "tau": 0.05, "noise": 0.1})
         options, task = goals.page.parse([*words, *own])
         task.env.close()
-        assert (options.steps, options.every, options.width, options.seed) == (10_000, 500, 64, 3)
+        assert (options.steps, options.every, options.width, options.seed) == (5_000, 250, 64, 3)
         assert (options.hindsight is None) == (arm in ("uniform", "HER"))
