@@ -202,3 +202,12 @@ def test_an_episode_of_options_is_saved_only_after_the_next_reset(options: dict[
     assert same(env.reset()[:1], [env.observations])
     other.load_state_dict(env.state_dict())
     assert same(drive(other, 0, 5), drive(env, 0, 5))
+
+
+def test_loading_releases_the_physics_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, released = VectorNavigationEnv(2, world="A", physics="kinematic"), []
+    env.reset(seed=0)
+    before = env._batch.drives
+    monkeypatch.setattr(before, "close", lambda: released.append(before), raising=True)
+    env.load_state_dict(env.state_dict())
+    assert released == [before] and env._batch.drives is not before
