@@ -13,6 +13,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import ROBOTS, RobotModel
 from mpfa_envs.deploy import Pilot, Scan, ScanError
+from mpfa_envs.deploy.adaptation import body_of
 from mpfa_envs.robots.drives import KinematicDrives
 from tests.envs.exported import card
 
@@ -142,3 +143,12 @@ def test_a_robot_that_cannot_stop_has_no_filter() -> None:
     message = r"clearance must be None for a policy of turtlebot2, .* 0.05 m/s .*, got 0.03"
     with pytest.raises(ValueError, match=message):
         Pilot(card(), lambda _: np.zeros((1, 2), np.float32), clearance=0.03)
+
+
+def test_what_a_robot_can_do_at_a_pace_is_more_in_the_units_of_the_training() -> None:
+    learned = ROBOTS["kobuki"]
+    robot = replace(learned, turn_acceleration=1.0, wheel_acceleration=0.1)
+    body = body_of(learned, robot, 0.5)
+    # At half of the pace time passes half as fast, so that changes of speed count four times.
+    assert (body.turn_acceleration, body.wheel_acceleration) == (4.0, pytest.approx(0.4))
+    assert body_of(robot, learned, 1.0).turn_acceleration == 1.0
