@@ -13,7 +13,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import ROBOTS, RobotModel
 from mpfa_envs.deploy import Pilot, Scan, ScanError
-from mpfa_envs.deploy.adaptation import body_of
+from mpfa_envs.deploy.adaptation import body_of, filter_of
 from mpfa_envs.robots.drives import KinematicDrives
 from tests.envs.exported import card
 
@@ -152,3 +152,11 @@ def test_what_a_robot_can_do_at_a_pace_is_more_in_the_units_of_the_training() ->
     # At half of the pace time passes half as fast, so that changes of speed count four times.
     assert (body.turn_acceleration, body.wheel_acceleration) == (4.0, pytest.approx(0.4))
     assert body_of(robot, learned, 1.0).turn_acceleration == 1.0
+
+
+@pytest.mark.parametrize(("reduction", "rays"), [("single", 1), ("min", 5), ("median", 5)])
+def test_a_sector_may_have_been_met_in_any_direction_but_where_it_has_one_ray(
+    reduction: str, rays: int
+) -> None:
+    keep = filter_of(card(**ALL_ROUND, reduction=reduction), KOBUKI, KOBUKI, 0.03)
+    assert keep is not None and keep._rays == rays

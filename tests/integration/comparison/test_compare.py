@@ -142,6 +142,7 @@ def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     assert (job in other_than_asked([job], [*many, setting])) == matters
 
 
+@pytest.mark.filterwarnings("ignore:policy learned behind the filter")
 @pytest.mark.parametrize(("needs", "asked"), [(True, None), (False, None), (True, False)])
 def test_policies_are_evaluated_behind_the_filter_that_they_need_unless_asked_otherwise(
     needs: bool, asked: bool | None, tmp_path: Path
