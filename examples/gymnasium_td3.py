@@ -336,6 +336,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     task_name = options.task.replace("/", "-").replace(":", "-")
     folder: Path = options.folder / f"{task_name}-{options.name}-{options.seed}"
     settings = {name: value for name, value in vars(options).items() if name != "folder"}
+    settings["networks"] = "TD3"  # Runs of earlier versions had others.
     with files.lock(folder):
         try:
             held = holds_result(folder, SCORES, settings)

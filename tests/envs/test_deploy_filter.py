@@ -152,6 +152,9 @@ def test_what_a_robot_can_do_at_a_pace_is_more_in_the_units_of_the_training() ->
     # At half of the pace time passes half as fast, so that changes of speed count four times.
     assert (body.turn_acceleration, body.wheel_acceleration) == (4.0, pytest.approx(0.4))
     assert body_of(robot, learned, 1.0).turn_acceleration == 1.0
+    ahead = replace(learned, reverse=False)
+    assert not body_of(learned, ahead, 1.0).reverse and not body_of(ahead, learned, 1.0).reverse
+    assert body_of(learned, learned, 1.0).reverse
 
 
 @pytest.mark.parametrize(("reduction", "rays"), [("single", 1), ("min", 5), ("median", 5)])

@@ -30,6 +30,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.deploy.card import CardError
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.sensing.sensors import describe_sensors, resolve_sensors
 
 TASK: dict[str, Any] = {"physics": "kinematic", "robot": "kobuki"}
 REAR = LidarSensor(mount=(-0.1, 0.05, 180.0), sectors=6, field_of_view=120.0)
@@ -215,6 +216,24 @@ def test_a_policy_with_a_sensor_of_your_own_asks_for_the_same_one(tmp_path: Any)
     del SENSORS["it"]
     with pytest.raises(ValueError, match=r"names in SENSORS.*got 'it'.*plugin"):
         TaskConfig(**loaded.env_arguments)
+
+
+def test_a_class_of_your_own_with_the_name_of_ours_is_not_taken_for_it() -> None:
+    own = type("LidarSensor", (Bearing,), {})()
+    facts = describe_sensors({"it": own})
+    assert facts is not None and facts["it"]["kind"] == "LidarSensor"
+    SENSORS["it"] = own
+    assert resolve_sensors(facts) == {"it": own}
+
+
+def test_a_second_lidar_is_as_close_as_its_own_distance_says() -> None:
+    env = VectorNavigationEnv(
+        2, world="D", sensors={"rear": REAR, "far": replace(REAR, closeness_distance=1.0)}, **TASK
+    )
+    seen, _ = env.reset(seed=3)
+    rear, far = (seen[:, env.config.observation_slices[name]] for name in ("rear", "far"))
+    np.testing.assert_allclose(far, np.minimum(4.0 * rear, 1.0), rtol=1e-5)
+    assert (far < 1.0).any()
 
 
 def test_a_reward_senses_after_each_time_step() -> None:

@@ -285,17 +285,18 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
             functional = torch.func.functionalize(lambda *values: module(*values))
             with mode:
                 graph = make_fx(functional, decomposition_table=select_decomp_table())(*fakes)
-            return compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
+            made: Any = compile_fx_inner(graph, fakes, cpp_wrapper=config.cpp_wrapper)
+            return made.current_callable
 
-    # To try each vector instruction set of the processor takes three times as long as the program.
-    tried = {"cpp.vec_isa_ok": True, **patches}
+    # To try each vector instruction set of the processor takes longer than to compile a program. An
+    # old compiler may not have the newest of them: they are tried if it fails.
+    untried = on_cpu and config.cpp.vec_isa_ok is None and "cpp.vec_isa_ok" not in patches
     try:
-        call = compiled(tried).current_callable
+        call = compiled({**patches, "cpp.vec_isa_ok": True} if untried else patches)
     except Exception:
-        if not on_cpu or "cpp.vec_isa_ok" in patches:
+        if not untried:
             raise
-        # An old compiler may not have the newest of them.
-        call = compiled(patches).current_callable
+        call = compiled(patches)
     finally:
         # Others may want them tried.
         valid_vec_isa_list.cache_clear()

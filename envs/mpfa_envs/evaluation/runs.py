@@ -136,7 +136,8 @@ def run_tasks(
         envs_at_once = ENVS_AT_ONCE if takes_many else 1
     check_count("envs_at_once", envs_at_once)
     _warn_of_another_robot(policy, resolve_robot(env_arguments.get("robot", "turtlebot2")))
-    if getattr(policy, "card", {}).get("filter"):
+    card = getattr(policy, "card", None)
+    if isinstance(card, Mapping) and card.get("filter"):
         warnings.warn(
             "policy learned behind the filter and drives without it: Filtered(policy, "
             "TaskConfig(**policy.env_arguments).make_filter()) has it",

@@ -190,9 +190,10 @@ def _find(name: str) -> Sensor:
 
 def _find_described(name: str, facts: Mapping[str, Any]) -> Sensor:
     """Make a second lidar as described, or find another sensor, which must be as described."""
-    if facts.get("kind") == LidarSensor.__name__:
-        given = {entry.name: facts[entry.name] for entry in fields(LidarSensor) if entry.init}
-        return LidarSensor(**given)
+    own = [entry.name for entry in fields(LidarSensor) if entry.init]
+    # A class of a user may have the same name.
+    if facts.get("kind") == LidarSensor.__name__ and {*own} <= facts.keys():
+        return LidarSensor(**{entry: facts[entry] for entry in own})
     found = _find(name)
     present = (describe_sensors({name: found}) or {})[name]
     for entry in {*facts, *present}:

@@ -199,6 +199,21 @@ def test_vector_instructions_are_tried_only_where_a_program_cannot_be_made_with_
     assert asked == [True, None]
 
 
+def test_a_wish_about_vector_instructions_is_kept(monkeypatch):
+    asked = []
+
+    def compile(module, inputs, **_):
+        asked.append(config.cpp.vec_isa_ok)
+        return SimpleNamespace(current_callable=lambda values: module.forward(*values))
+
+    monkeypatch.setattr(compile_fx, "compile_fx_inner", compile)
+    for wish, options in ((False, {}), (None, {"options": {"cpp.vec_isa_ok": False}})):
+        monkeypatch.setattr(program, "_COMPILED", {})
+        with config.patch({"cpp.vec_isa_ok": wish}):
+            update_both(make_pair("ddpg", options or True), 0)
+    assert asked == [False, False]
+
+
 @pytest.mark.slow
 def test_a_graph_that_was_compiled_is_read_from_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
