@@ -86,7 +86,8 @@ class EnvironmentSettings:
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off obstacles
     (:class:`mpfa_envs.SafetyFilter`); ``filter_cost`` says which action is stored. With 1
-    evaluations have the filter, too, and a policy needs it. DQN and Q learning have none."""
+    evaluations have the filter, too, and a policy needs it. Episodes still end, as collisions, at
+    ``clearance``: the filter lets a robot pass by at 0.01 m. DQN and Q learning have none."""
     filter_cost: float | None = setting(None, NOT_NEGATIVE)
     """Cost of an action that the filter changes, times the larger change of the two wheels; also of
     0 the buffer stores the action that was chosen, so that the critic learns what the filter
