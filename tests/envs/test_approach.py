@@ -11,6 +11,7 @@ import pytest
 from benchmarks.people import Discs, cast, drive_among_walkers
 from mpfa_envs import ROBOTS, SafetyFilter, TaskConfig
 from mpfa_envs.deploy import Pilot, Scan
+from mpfa_envs.deploy.adaptation import nearest_admissible
 from mpfa_envs.robots.motion_loops import changed
 from mpfa_envs.safety.loops import room_for_points, see
 from tests.envs.exported import card
@@ -148,6 +149,20 @@ def test_a_known_wall_in_full_view_slows_a_robot_no_more_than_one_where_nothing_
     assert (keep(everywhere, fast, still=known) == fast).all()
     with pytest.raises(ValueError, match="still must have shape"):
         keep(wall, fast, still=known[1:])
+
+
+def test_a_known_wall_that_is_hidden_counts_as_what_comes() -> None:
+    keep = CONFIG.make_filter(approach=1.0)
+    sectors = CONFIG.make_lidar().sectors
+    states, known = observed(CONFIG, 0.5, 0.3, 0.3)[None], np.ones((1, sectors), np.bool_)
+    seen, hidden = np.zeros(sectors, np.bool_), np.ones(sectors, np.bool_)
+    robot = CONFIG.robot
+
+    def ordered(still: Any, out_of_view: Any) -> tuple[float, float]:
+        return nearest_admissible(keep, robot, (states, still, out_of_view), (0.3, 0.3), 0.0)
+
+    assert ordered(known, seen) == pytest.approx((0.3, 0.3))
+    assert ordered(known, hidden) == ordered(None, seen) != pytest.approx((0.3, 0.3))
 
 
 def test_directions_out_of_view_hold_nothing_that_comes() -> None:
