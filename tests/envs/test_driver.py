@@ -137,3 +137,18 @@ def test_before_the_first_reset_there_is_no_errand() -> None:
     with pytest.raises(ResetNeeded, match=r"there is no errand: call reset\(\) first"):
         env.errand(0)
     env.close()
+
+
+def test_the_senses_of_some_robots_are_their_rows() -> None:
+    env = VectorNavigationEnv(4, world="C", plan="known", **TASK)
+    env.reset(seed=3)
+    every = env.senses(np.arange(4))
+    some = every.of(np.array([True, False, False, True]))
+    apart = env.senses(np.array([0, 3]))
+    for name in ("robots", "observations", "states", "motions", "poses", "goals"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(apart, name), err_msg=name)
+    assert some.find_still is not None and apart.find_still is not None
+    assert some.find_still().shape == (2, env.config.make_lidar().sectors)
+    np.testing.assert_array_equal(some.find_still(), apart.find_still())
+    assert some.find_still().any()
+    env.close()
