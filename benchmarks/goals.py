@@ -1,7 +1,8 @@
 """Make runs on goal tasks of gymnasium-robotics, and keep their rows.
 
     python -m benchmarks.goals search             choose the settings, by HER on seeds of its own
-    python -m benchmarks.goals                    make the runs, write docs/results/goals.csv
+    python -m benchmarks.goals                    make the runs, write docs/results/goals.csv, and
+                                                  what was sampled into goals_replay.csv beside it
     python -m benchmarks.goals --kept             print the tables of the kept rows
     python -m benchmarks.goals --tasks FetchReach-v4 --seeds 100 101
 
@@ -16,16 +17,19 @@ import argparse
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
 import gymnasium_td3 as page
 from benchmarks.planned import Planned, planned_table
 from benchmarks.rivals import missing
-from training.comparison.scores import COLUMNS, score_tables
+from training.comparison.report import interval, number, table
+from training.comparison.scores import COLUMNS
 from training.files import run_script
 from training.records import area_under, read_table, write_table
+from training.statistics import mean_interval
 
 KEPT = Path(__file__).parents[1] / "docs" / "results" / "goals.csv"
 SEARCHED = KEPT.with_name("goals_search.csv")
@@ -46,6 +50,8 @@ STEPS: Final[Mapping[str, int]] = {
     "FetchPush-v4": 100_000,
 }
 """Steps of a run, of which twenty have an evaluation after them."""
+PLANNED: Final = tuple(STEPS)[:3]
+"""Tasks of the planned comparisons."""
 POSITIVE: Final[Mapping[str, float]] = {"FetchReach-v4": -0.5, "FetchPush-v4": -0.5}
 """Level above which a reward is positive for MPFA-PER: a step costs 1 there until the goal."""
 COMMON: Final = {"width": 64, "batch-size": 256, "start": 1_000}
@@ -55,6 +61,15 @@ CANDIDATES: Final = [
     {"gamma": gamma, "tau": tau, "noise": noise}
     for gamma, tau, noise in product((0.95, 0.98), (0.005, 0.05), (0.1, 0.3))
 ]
+SAMPLED: Final = {
+    "share/reward": "share of the reward",
+    "share/td_error": "of the TD error",
+    "share/action_gradient": "of the action gradient",
+    "positive_fraction_buffer": "positive in the buffer",
+    "positive_fraction_batch": "positive in a batch",
+    "effective_sample_size": "effective sample size",
+}
+"""What is kept of the statistics of a replay (``docs/metrics.md``), and how a table names it."""
 SEARCH_SEEDS: Final = (900, 901)
 SEEDS: Final = range(100, 110)
 SB3_SEEDS: Final = range(100, 105)
@@ -71,20 +86,24 @@ def words_of(task: str, seed: int, settings: Mapping[str, float]) -> list[str]:
 
 def run(
     task: str, arm: str, seed: int, settings: Mapping[str, float], folder: Path
-) -> pd.DataFrame:
-    """Make a run; return its rows with the name of the arm."""
+) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """Make a run; return its scores and what its replay says of itself, by the name of the arm."""
     words = words_of(task, seed, settings)
+    name: dict[str, Any] = {"task": task, "method": arm, "seed": seed}
     if arm == SB3:
         from benchmarks.sb3_goals import train
 
-        scores = train(page.parse(words)[0])
-        rows = pd.DataFrame(scores, columns=["steps", "score"])
-    else:
-        own = [*ARMS[arm], "--folder", str(folder)]
-        if arm.startswith("MPFA") and task in POSITIVE:
-            own.append(f"--positive-above={POSITIVE[task]}")
-        rows = read_table(page.main([*words, *own]) / page.SCORES)
-    return rows.assign(task=task, method=arm, seed=seed)[list(COLUMNS)]
+        scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
+        return scores.assign(**name)[list(COLUMNS)], None
+    own = [*ARMS[arm], "--folder", str(folder)]
+    if arm.startswith("MPFA") and task in POSITIVE:
+        own.append(f"--positive-above={POSITIVE[task]}")
+    made = page.main([*words, *own])
+    scores, said = (
+        read_table(made / file).assign(**name) for file in (page.SCORES, page.STATISTICS)
+    )
+    names = [*COLUMNS[:-1], *said.columns.intersection(list(SAMPLED))]
+    return scores[list(COLUMNS)], said[names]
 
 
 def make(tasks: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path) -> None:
@@ -92,21 +111,41 @@ def make(tasks: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path) -
     for seed, task, arm in product(seeds, tasks, (*ARMS, SB3)):
         if arm == SB3 and seed not in SB3_SEEDS:
             continue
-        rows = read_table(kept) if kept.exists() else pd.DataFrame(columns=list(COLUMNS))
-        if missing(rows[rows["task"] == task], arm, [seed]):
-            new = run(task, arm, seed, CHOSEN[task], folder)
-            write_table(pd.concat([rows, new]) if len(rows) else new, kept)
+        if missing(rows_of(kept, task), arm, [seed]):
+            scores, said = run(task, arm, seed, CHOSEN[task], folder)
+            if said is not None:
+                add(said, sampled_of(kept))
+            add(scores, kept)
+
+
+def sampled_of(kept: Path) -> Path:
+    """Return the file of what was sampled, beside that of the scores."""
+    return kept.with_name(f"{kept.stem}_replay.csv")
+
+
+def rows_of(kept: Path, task: str) -> pd.DataFrame:
+    """Return the rows of a task that are kept."""
+    rows = read_table(kept) if kept.exists() else pd.DataFrame(columns=list(COLUMNS))
+    return rows[rows["task"] == task]
+
+
+def add(rows: pd.DataFrame, kept: Path) -> None:
+    """Add the rows of a run to those that are kept, in place of rows of the same run."""
+    if kept.exists():
+        run_of = list(COLUMNS[:3])
+        before = read_table(kept)
+        same = before[run_of].apply(tuple, axis=1).isin(rows[run_of].apply(tuple, axis=1))
+        rows = pd.concat([before[~same], rows])
+    write_table(rows, kept)
 
 
 def search(tasks: Sequence[str], folder: Path, kept: Path) -> str:
     """Make HER's runs with each candidate; return the mean area of each, the best first."""
     for task, candidate, seed in product(tasks, CANDIDATES, SEARCH_SEEDS):
         name = " ".join(f"{key}={value:g}" for key, value in candidate.items())
-        rows = read_table(kept) if kept.exists() else pd.DataFrame(columns=list(COLUMNS))
-        if missing(rows[rows["task"] == task], name, [seed]):
-            new = run(task, "HER", seed, candidate, folder / name.replace(" ", "-"))
-            new = new.assign(method=name)
-            write_table(pd.concat([rows, new]) if len(rows) else new, kept)
+        if missing(rows_of(kept, task), name, [seed]):
+            scores, _ = run(task, "HER", seed, candidate, folder / name.replace(" ", "-"))
+            add(scores.assign(method=name), kept)
     found = areas(read_table(kept)).groupby(["task", "method"])["area"].mean().reset_index()
     found = found.sort_values(["task", "area"], ascending=[True, False])
     return "\n".join(f"{r.task}: {r.method}: {r.area:.3f}" for r in found.itertuples())
@@ -122,11 +161,11 @@ def areas(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables(kept: Path = KEPT) -> str:
-    """Return what the design planned, and the tables of each task."""
-    from training.comparison.scores import runs_by_task
-
-    of_runs = areas(read_table(kept))
-    mean = of_runs.groupby(["method", "seed"])["area"].mean()
+    """Return what the design planned, a table of each task, and what was sampled."""
+    rows = read_table(kept)
+    of_runs = areas(rows)
+    # Stable-Baselines3 and a task that is apart are in no planned comparison.
+    mean = of_runs[of_runs["task"].isin(PLANNED)].groupby(["method", "seed"])["area"].mean()
 
     def planned(ours: str, theirs: str) -> Planned:
         sides = ({str(s): float(v) for s, v in mean[arm].items()} for arm in (ours, theirs))
@@ -136,9 +175,37 @@ def tables(kept: Path = KEPT) -> str:
     primary = [planned(per, her)]
     secondary = [planned(mpfa, per), planned(halves, her), planned(her, uniform)]
     parts = [planned_table(primary, secondary)]
-    for task, runs in runs_by_task([kept]).items():
-        parts += [f"## {task}", *score_tables(runs)]
+    for task in [name for name in STEPS if (rows["task"] == name).any()]:
+        parts += [f"## {task}", task_table(rows[rows["task"] == task], of_runs)]
+    if sampled_of(kept).exists():
+        parts += ["## What was sampled", sampled_table(read_table(sampled_of(kept)))]
     return "\n\n".join(parts)
+
+
+def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
+    """Return a task's areas and last scores: means, their intervals, and each run."""
+    task, lines = rows["task"].iloc[0], []
+    for arm in [name for name in (*ARMS, SB3) if (rows["method"] == name).any()]:
+        own = of_runs[(of_runs["task"] == task) & (of_runs["method"] == arm)]["area"].to_numpy()
+        of_arm = rows[rows["method"] == arm].sort_values("steps")
+        last = of_arm.groupby("seed")["score"].last().to_numpy()
+        line = [arm]
+        for found in (own, last):
+            middle = mean_interval(found)
+            line += [number(middle.value), interval(middle, [found], number)]
+        lines.append([*line, ", ".join(f"{value:.2f}" for value in own)])
+    return table(["arm", "area", "95 %", "at the end", "95 %", "area of each run"], lines)
+
+
+def sampled_table(rows: pd.DataFrame) -> str:
+    """Return what each arm sampled of each task: means over updates and runs."""
+    lines = []
+    for (task, arm), found in rows.groupby(["task", "method"], sort=False):
+        means = found.reindex(columns=list(SAMPLED)).mean()
+        lines.append(
+            [str(task), str(arm), *("–" if np.isnan(v) else number(float(v)) for v in means)]
+        )
+    return table(["task", "arm", *SAMPLED.values()], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -149,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", nargs="?", choices=["runs", "search"], default="runs")
-    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), default=list(STEPS)[:3])
+    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), default=list(PLANNED))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--folder", type=Path, default=Path("runs/goals"), help="of the runs")
     parser.add_argument("--output", type=Path, help="of the rows")

@@ -10,7 +10,8 @@ MuJoCo's tasks need the extra ``mujoco``, those of gymnasium-robotics the extra 
 Batches of 100, rates of 0.001 and the form of the networks are those of TD3's paper; layers have
 256 units, and the first 5,000 steps are at random. ``scores.csv`` in the folder of a run has the
 mean return of ten episodes without noise, or of goal tasks the share of episodes that end at their
-goal. The file is written at the end: a run that was stopped begins again.
+goal. ``replay.csv`` says at the same steps what was sampled, and the weights and shares of signals
+(``docs/metrics.md``). Both are written at the end: a run that was stopped begins again.
 
 A goal task has observations with ``achieved_goal`` and ``desired_goal``, and pays by
 ``compute_reward``. Networks read the goal as a part of the observation, whose numbers are
@@ -22,8 +23,6 @@ a buffer and a loss are trained by ``train.py``.
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -33,6 +32,7 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
@@ -43,17 +43,17 @@ import torchrl_mpfa as mpfa
 from torchrl_mpfa.methods import loss_options, make_replay, method_named
 from torchrl_mpfa.methods.her import GymnasiumGoals, HindsightGoals
 from torchrl_mpfa.networks import DirectModule
-from torchrl_mpfa.saving import write_text_atomically
 from torchrl_mpfa.selection import SampledBatch
 from training import files
 from training.finished import holds_result
+from training.records import write_table
 
 LEARNING_RATE = 1e-3
 STEPS_A_ROUND = 10
 """Steps of the task between two rounds of as many updates."""
 EPISODES = 10
 """Episodes of an evaluation."""
-SCORES = "scores.csv"
+SCORES, STATISTICS = "scores.csv", "replay.csv"
 GIVEN = {"episode", "hindsight"}
 """What this page gives a method beside its buffer, hindsight on goal tasks alone."""
 _FARTHEST = 5.0
@@ -222,8 +222,8 @@ def score(name: str, acts: Acts, *, seed: int) -> float:
     return total / EPISODES
 
 
-def train(options: argparse.Namespace, task: Task) -> list[list[object]]:
-    """Train; return a row of each evaluation: task, method, seed, steps, score."""
+def train(options: argparse.Namespace, task: Task) -> pd.DataFrame:
+    """Train; return a row of each evaluation: its score, and what the replay says of itself."""
     torch.manual_seed(options.seed)
     source = np.random.default_rng(options.seed)
     replay = make_replay(options.replay, **options.method)
@@ -252,7 +252,7 @@ def train(options: argparse.Namespace, task: Task) -> list[list[object]]:
     )
     scale = Scale(task.observations, moves=task.has_goal)
     acts = Acts(actor, scale)
-    rows: list[list[object]] = []
+    rows: list[dict[str, object]] = []
     for done in (bar := trange(STEPS_A_ROUND, options.steps + 1, STEPS_A_ROUND, unit="round")):
         learning = done > options.start
         found = collect(task, acts if learning else None, source, noise=options.noise)
@@ -271,9 +271,12 @@ def train(options: argparse.Namespace, task: Task) -> list[list[object]]:
             )
         if done % options.every < STEPS_A_ROUND:
             reached = score(options.task, acts, seed=1_000_000)
-            rows.append([options.task, f"td3/{options.name}", options.seed, done, reached])
+            rows.append({"steps": done, "score": reached, **replay.buffer.stats()})
             bar.set_postfix_str(f"score {reached:.4g}")
-    return rows
+    table = pd.DataFrame(rows)
+    for name in ("seed", "method", "task"):
+        table.insert(0, name, f"td3/{options.name}" if name == "method" else getattr(options, name))
+    return table
 
 
 def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
@@ -347,11 +350,9 @@ def main(arguments: Sequence[str] | None = None) -> Path:
             return folder
         torch.set_num_threads(1)
         torch.set_flush_denormal(True)  # Tiny numbers would slow a CPU down.
-        text = io.StringIO()
-        written = csv.writer(text, lineterminator="\n")
-        written.writerow(["task", "method", "seed", "steps", "score"])
-        written.writerows(train(options, task))
-        write_text_atomically(text.getvalue(), folder / SCORES)
+        found = train(options, task)
+        write_table(found.drop(columns="score"), folder / STATISTICS)
+        write_table(found[["task", "method", "seed", "steps", "score"]], folder / SCORES)
     print(f"written: {folder / SCORES}")
     return folder
 

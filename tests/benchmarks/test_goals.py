@@ -25,9 +25,11 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, int]]:
     """The runs that were asked for, in place of runs."""
     asked: list[tuple[str, str, int]] = []
 
-    def run(task: str, arm: str, seed: int, *_: Any) -> pd.DataFrame:
+    def run(task: str, arm: str, seed: int, *_: Any) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         asked.append((task, arm, seed))
-        return rows_of(task, arm, seed, 0.5)
+        scores = rows_of(task, arm, seed, 0.5)
+        said = scores.drop(columns="score").assign(**{"share/reward": 0.25})
+        return scores, None if arm == goals.SB3 else said
 
     monkeypatch.setattr(goals, "run", run)
     monkeypatch.setattr(goals, "CHOSEN", {task: {} for task in TASKS})
@@ -44,8 +46,19 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     # Stable-Baselines3 has five seeds.
     assert {arm for task, arm, seed in made if seed == 105} == {*goals.ARMS}
     assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
+    said = read_table(goals.sampled_of(kept))
+    assert {*said["method"]} == {*goals.ARMS} and len(said) == 2 * 2 * 2 * len(goals.ARMS)
     goals.make(TASKS, [104, 105, 106], tmp_path, kept)
     assert {seed for *_, seed in made[22:]} == {106}
+
+
+def test_rows_of_a_run_take_the_place_of_rows_of_the_same_run(tmp_path: Path) -> None:
+    kept = tmp_path / "kept.csv"
+    for arm, height in (("HER", 0.1), ("uniform", 0.2), ("HER", 0.3)):
+        goals.add(rows_of(TASKS[0], arm, 100, height), kept)
+    found = read_table(kept)
+    assert found["method"].tolist() == ["uniform"] * 2 + ["HER"] * 2
+    assert found["score"].tolist() == [0.2, 0.2, 0.3, 0.3]
 
 
 def test_candidates_of_the_search_are_ordered_by_their_mean_area(
@@ -53,7 +66,7 @@ def test_candidates_of_the_search_are_ordered_by_their_mean_area(
 ) -> None:
     def run(task: str, arm: str, seed: int, settings: Any, *_: Any) -> pd.DataFrame:
         assert arm == "HER" and seed in goals.SEARCH_SEEDS
-        return rows_of(task, arm, seed, settings["gamma"] - settings["tau"])
+        return rows_of(task, arm, seed, settings["gamma"] - settings["tau"]), None
 
     monkeypatch.setattr(goals, "run", run)
     said = goals.search(TASKS[:1], tmp_path, tmp_path / "search.csv").splitlines()
@@ -88,3 +101,19 @@ def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
         task.env.close()
         assert (options.steps, options.every, options.width, options.seed) == (5_000, 250, 64, 3)
         assert (options.hindsight is None) == (arm in ("uniform", "HER"))
+
+
+def test_what_an_arm_sampled_is_a_mean_over_its_updates_and_runs(tmp_path: Path) -> None:
+    kept = tmp_path / "goals.csv"
+    rows = [rows_of(TASKS[0], arm, seed, 0.5) for arm in goals.ARMS for seed in range(2)]
+    write_table(pd.concat(rows), kept)
+    scores = rows_of(TASKS[0], "HER", 0, 0.5).drop(columns="score")
+    # No batch was sampled before the first evaluation.
+    said = [scores.assign(seed=s, positive_fraction_batch=[None, 0.2 + 0.2 * s]) for s in range(2)]
+    write_table(pd.concat(said), goals.sampled_of(kept))
+    *_, task, _, sampled = goals.tables(kept).split("\n\n")
+    assert len(task.splitlines()) == 2 + len(goals.ARMS)
+    [line] = sampled.splitlines()[2:]
+    values = dict(zip(goals.SAMPLED, line.split(" | ")[2:], strict=True))
+    assert values["share/reward"] == "–"
+    assert float(values["positive_fraction_batch"]) == pytest.approx(0.3)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import gymnasium_td3
 import torchrl_mpfa as mpfa
-from gymnasium_td3 import SCORES, Scale, Task, collect, score
+from gymnasium_td3 import SCORES, STATISTICS, Scale, Task, collect, score
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.her import GymnasiumGoals
 from torchrl_mpfa.selection import SampledBatch
@@ -71,9 +71,9 @@ def rounds_of(number: int) -> tuple[Task, TensorDictBase]:
     return task, rows
 
 
-def scores_in(folder: Path) -> list[dict[str, str]]:
-    """The rows of a run's scores."""
-    with (folder / SCORES).open() as file:
+def scores_in(folder: Path, name: str = SCORES) -> list[dict[str, str]]:
+    """The rows of a run's scores, or of what its replay says of itself."""
+    with (folder / name).open() as file:
         return list(csv.DictReader(file))
 
 
@@ -155,6 +155,10 @@ def test_run_with_scores_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
     rows = scores_in(folder)
     assert [row["steps"] for row in rows] == ["200"]
     assert {row["method"] for row in rows} == {"td3/mpfa_per"}
+    [said] = scores_in(folder, STATISTICS)
+    assert (said["steps"], said["size"]) == ("200", "200")
+    shares = [float(value) for name, value in said.items() if name.startswith("share/")]
+    assert len(shares) == 3 and sum(shares) == pytest.approx(1.0)
     monkeypatch.setattr(gymnasium_td3, "train", lambda *_: pytest.fail("made again"))
     assert gymnasium_td3.main(command) == folder
     with pytest.raises(SystemExit):
