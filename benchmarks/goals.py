@@ -19,7 +19,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 import gymnasium_td3 as page
@@ -91,7 +90,7 @@ def words_of(task: str, seed: int, settings: Mapping[str, float]) -> list[str]:
 def run(
     task: str, arm: str, seed: int, settings: Mapping[str, float], folder: Path
 ) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """Make a run; return its scores and what its replay says of itself, by the name of the arm."""
+    """Make a run; return its scores and, of several signals, what was sampled by them."""
     words = words_of(task, seed, settings)
     name: dict[str, Any] = {"task": task, "method": arm, "seed": seed}
     if arm == SB3:
@@ -100,14 +99,14 @@ def run(
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
     own = [*ARMS[arm], "--folder", str(folder)]
-    if arm.startswith("MPFA") and task in POSITIVE:
+    several = arm.startswith("MPFA")
+    if several and task in POSITIVE:
         own.append(f"--positive-above={POSITIVE[task]}")
     made = page.main([*words, *own])
     scores, said = (
         read_table(made / file).assign(**name) for file in (page.SCORES, page.STATISTICS)
     )
-    names = [*COLUMNS[:-1], *said.columns.intersection(list(SAMPLED))]
-    return scores[list(COLUMNS)], said[names]
+    return scores[list(COLUMNS)], said[[*COLUMNS[:-1], *SAMPLED]] if several else None
 
 
 def make(tasks: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path) -> None:
@@ -202,14 +201,10 @@ def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
 
 
 def sampled_table(rows: pd.DataFrame) -> str:
-    """Return what each arm sampled of each task: means over updates and runs."""
-    lines = []
-    for (task, arm), found in rows.groupby(["task", "method"], sort=False):
-        means = found.reindex(columns=list(SAMPLED)).mean()
-        lines.append(
-            [str(task), str(arm), *("–" if np.isnan(v) else number(float(v)) for v in means)]
-        )
-    return table(["task", "arm", *SAMPLED.values()], lines)
+    """Return what was sampled of each task by several signals: means over evaluations and runs."""
+    means = rows.groupby("task", sort=False)[list(SAMPLED)].mean()
+    lines = [[str(task), *map(number, of.tolist())] for task, of in means.iterrows()]
+    return table(["task", *SAMPLED.values()], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
