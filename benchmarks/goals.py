@@ -58,6 +58,7 @@ _FAST: Final = {"gamma": 0.98, "tau": 0.05, "noise": 0.3}
 CHOSEN: Final[Mapping[str, Mapping[str, float]]] = {
     "FetchReach-v4": _FAST,
     "PointMaze_UMaze-v3": _FAST,
+    "PointMaze_Medium-v3": _FAST,
 }
 """What the search chose for each task."""
 CANDIDATES: Final = [
