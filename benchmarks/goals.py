@@ -32,13 +32,13 @@ from training.statistics import mean_interval
 
 KEPT = Path(__file__).parents[1] / "docs" / "results" / "goals.csv"
 SEARCHED = KEPT.with_name("goals_search.csv")
-SB3 = "SB3's HER"
+SB3, PER, MPFA = "SB3's HER", "PER with hindsight", "MPFA-PER with hindsight"
 HINDSIGHT = ["--hindsight", "4"]
 ARMS: Final[Mapping[str, Sequence[str]]] = {
     "uniform": ["--replay", "uniform"],
     "HER": ["--replay", "her"],
-    "PER with hindsight": ["--replay", "per", *HINDSIGHT],
-    "MPFA-PER with hindsight": ["--replay", "mpfa_per", *HINDSIGHT],
+    PER: ["--replay", "per", *HINDSIGHT],
+    MPFA: ["--replay", "mpfa_per", *HINDSIGHT],
     "half batches with hindsight": ["--replay", "uniform_halves", *HINDSIGHT],
 }
 """What an arm says beside the settings of the task."""
@@ -92,7 +92,7 @@ def words_of(task: str, seed: int, settings: Mapping[str, float]) -> list[str]:
 def run(
     task: str, arm: str, seed: int, settings: Mapping[str, float], folder: Path
 ) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """Make a run; return its scores and, of several signals, what was sampled by them."""
+    """Make a run; return its scores and, where priorities decide, what was sampled."""
     words = words_of(task, seed, settings)
     name: dict[str, Any] = {"task": task, "method": arm, "seed": seed}
     if arm == SB3:
@@ -101,14 +101,22 @@ def run(
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
     own = [*ARMS[arm], "--folder", str(folder)]
-    several = arm.startswith("MPFA")
-    if several and task in POSITIVE:
+    if arm == MPFA and task in POSITIVE:
         own.append(f"--positive-above={POSITIVE[task]}")
     made = page.main([*words, *own])
     scores, said = (
         read_table(made / file).assign(**name) for file in (page.SCORES, page.STATISTICS)
     )
-    return scores[list(COLUMNS)], said[[*COLUMNS[:-1], *SAMPLED]] if several else None
+    return scores[list(COLUMNS)], sampled(said, arm)
+
+
+def sampled(said: pd.DataFrame, arm: str) -> pd.DataFrame | None:
+    """Return what is kept of the statistics of a run; None where all are sampled alike."""
+    if arm not in (PER, MPFA):
+        return None
+    # To PER nothing is positive, and its only signal has all of the share.
+    of_arm = list(SAMPLED) if arm == MPFA else ["effective_sample_size"]
+    return said.reindex(columns=[*COLUMNS[:-1], *of_arm]).reindex(columns=[*COLUMNS[:-1], *SAMPLED])
 
 
 def make(tasks: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path) -> None:
@@ -169,22 +177,33 @@ def tables(kept: Path = KEPT) -> str:
     """Return what the design planned, a table of each task, and what was sampled."""
     rows = read_table(kept)
     of_runs = areas(rows)
-    # Stable-Baselines3 and a task that is apart are in no planned comparison.
-    mean = of_runs[of_runs["task"].isin(PLANNED)].groupby(["method", "seed"])["area"].mean()
-
-    def planned(ours: str, theirs: str) -> Planned:
-        sides = ({str(s): float(v) for s, v in mean[arm].items()} for arm in (ours, theirs))
-        return Planned(f"{ours} − {theirs}", "area, mean of the tasks", *sides)
-
-    uniform, her, per, mpfa, halves = ARMS
-    primary = [planned(per, her)]
-    secondary = [planned(mpfa, per), planned(halves, her), planned(her, uniform)]
-    parts = [planned_table(primary, secondary)]
+    parts = [planned_differences(of_runs)]
     for task in [name for name in STEPS if (rows["task"] == name).any()]:
         parts += [f"## {task}", task_table(rows[rows["task"] == task], of_runs)]
     if sampled_of(kept).exists():
         parts += ["## What was sampled", sampled_table(read_table(sampled_of(kept)))]
     return "\n\n".join(parts)
+
+
+def planned_differences(of_runs: pd.DataFrame) -> str:
+    """Return the planned table, or which runs it still needs."""
+    # Stable-Baselines3 and a task that is apart are in no planned comparison.
+    areas_of = of_runs[of_runs["task"].isin(PLANNED) & of_runs["method"].isin(list(ARMS))]
+    runs = areas_of.pivot_table("area", "seed", ["method", "task"])
+    runs = runs.reindex(columns=pd.MultiIndex.from_product([list(ARMS), PLANNED]))
+    if runs.isna().any(axis=None):
+        names = [f"{arm} on {task}" for (arm, task), gap in runs.isna().any().items() if gap]
+        return f"The planned comparisons need more runs: {', '.join(names)}."
+    mean = runs.T.groupby(level=0).mean()
+
+    def planned(ours: str, theirs: str) -> Planned:
+        sides = ({str(s): float(v) for s, v in mean.loc[arm].items()} for arm in (ours, theirs))
+        return Planned(f"{ours} − {theirs}", "area, mean of the tasks", *sides)
+
+    uniform, her, per, mpfa, halves = ARMS
+    primary = [planned(per, her)]
+    secondary = [planned(mpfa, per), planned(halves, her), planned(her, uniform)]
+    return planned_table(primary, secondary)
 
 
 def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
@@ -203,10 +222,13 @@ def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
 
 
 def sampled_table(rows: pd.DataFrame) -> str:
-    """Return what was sampled of each task by several signals: means over evaluations and runs."""
-    means = rows.groupby("task", sort=False)[list(SAMPLED)].mean()
-    lines = [[str(task), *map(number, of.tolist())] for task, of in means.iterrows()]
-    return table(["task", *SAMPLED.values()], lines)
+    """Return what was sampled in each task: means over evaluations after updates, and runs."""
+    learned = rows.dropna(subset="effective_sample_size")
+    lines = []
+    for (task, arm), found in learned.groupby(["task", "method"], sort=False):
+        means = found[list(SAMPLED)].mean().tolist()
+        lines.append([str(task), str(arm), *("" if v != v else number(v) for v in means)])
+    return table(["task", "arm", *SAMPLED.values()], lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,8 +20,8 @@ GOALS = 4
 def train(options: argparse.Namespace) -> list[tuple[int, float]]:
     """Train with the options of ``gymnasium_td3.py``; return steps and scores.
 
-    Observations and goals are normalized as they are there, by the mean and the spread of what was
-    seen; rewards are not.
+    Observations and goals are normalized by the mean and the spread of what was seen, as they are
+    there but for the least spread; rewards are not. The networks also read the achieved goal.
     """
     torch.set_num_threads(1)
     env = VecNormalize(

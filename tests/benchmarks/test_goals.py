@@ -47,7 +47,7 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     assert {arm for task, arm, seed in made if seed == 105} == {*goals.ARMS}
     assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
     said = read_table(goals.sampled_of(kept))
-    assert {*said["method"]} == {"MPFA-PER with hindsight"} and len(said) == 2 * 2 * 2
+    assert {*said["method"]} == {goals.MPFA} and len(said) == 2 * 2 * 2
     goals.make(TASKS, [104, 105, 106], tmp_path, kept)
     assert {seed for *_, seed in made[22:]} == {106}
 
@@ -75,22 +75,42 @@ def test_candidates_of_the_search_are_ordered_by_their_mean_area(
     assert "gamma=0.95 tau=0.05" in said[-1]
 
 
-def test_planned_differences_are_of_the_means_over_the_tasks(tmp_path: Path) -> None:
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """Rows of eight seeds, in which PER is ahead by a fifth of a score."""
     heights = dict(zip(goals.ARMS, (0.1, 0.6, 0.8, 0.7, 0.65), strict=True))
     rows = [
         rows_of(task, arm, seed, height * factor + 0.001 * seed)
-        for task, factor in zip(TASKS, (1.0, 0.5), strict=True)
+        for task, factor in zip(goals.PLANNED, (1.0, 0.5, 0.0), strict=True)
         for arm, height in heights.items()
         for seed in range(8)
     ]
+    # What is beside them, and apart.
+    rows += [rows_of(TASKS[0], goals.SB3, 0, 1.0), rows_of("FetchPush-v4", "HER", 0, 1.0)]
     write_table(pd.concat(rows), tmp_path / "goals.csv")
-    table = goals.tables(tmp_path / "goals.csv").split("\n\n")[0].splitlines()[2:]
+    return tmp_path / "goals.csv"
+
+
+def test_planned_differences_are_of_the_means_over_the_tasks(kept: Path) -> None:
+    planned, *others = goals.tables(kept).split("\n\n")
+    table = planned.splitlines()[2:]
     # Three quarters of a score is the area of two equal ones that begin at zero.
     expected = (("PER with hindsight − HER", 0.2), ("MPFA-PER with hindsight − PER", -0.1))
     for line, (name, gap) in zip(table, expected, strict=False):
         assert line.startswith(f"| {name}")
-        assert float(line.split("|")[3]) == pytest.approx(0.75 * 0.75 * gap, abs=0.002)
+        assert float(line.split("|")[3]) == pytest.approx(0.75 * 0.5 * gap, abs=0.002)
     assert len(table) == 4
+    assert others[::2] == [f"## {task}" for task in goals.STEPS]
+    assert others[1].splitlines()[-1].startswith(f"| {goals.SB3} | 0.750 |")
+
+
+@pytest.mark.parametrize(("task", "seeds"), [("PointMaze_UMaze-v3", [3]), (TASKS[0], range(8))])
+def test_planned_differences_wait_for_all_runs(kept: Path, task: str, seeds: list[int]) -> None:
+    rows = read_table(kept)
+    gone = (rows["task"] == task) & (rows["method"] == "HER") & rows["seed"].isin(list(seeds))
+    write_table(rows[~gone], kept)
+    said = goals.tables(kept).split("\n\n")[0]
+    assert said == f"The planned comparisons need more runs: HER on {task}."
 
 
 def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
@@ -103,14 +123,18 @@ def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
         assert (options.hindsight is None) == (arm in ("uniform", "HER"))
 
 
-def test_what_was_sampled_is_a_mean_over_evaluations_and_runs(tmp_path: Path) -> None:
-    kept = tmp_path / "goals.csv"
-    rows = [rows_of(TASKS[0], arm, seed, 0.5) for arm in goals.ARMS for seed in range(2)]
-    write_table(pd.concat(rows), kept)
-    said = rows_of(TASKS[0], "MPFA-PER with hindsight", 0, 0.5).drop(columns="score")
-    # No batch was sampled before the first evaluation.
-    runs = [said.assign(**{key: [None, 0.2 + 0.2 * s] for key in goals.SAMPLED}) for s in range(2)]
-    write_table(pd.concat(runs), goals.sampled_of(kept))
-    *_, task, _, sampled = goals.tables(kept).split("\n\n")
-    assert len(task.splitlines()) == 2 + len(goals.ARMS)
-    assert sampled.splitlines()[2:] == [f"| {TASKS[0]} |" + " 0.300 |" * len(goals.SAMPLED)]
+def test_what_was_sampled_is_a_mean_over_evaluations_after_updates_and_runs(kept: Path) -> None:
+    said = pd.concat(
+        rows_of(TASKS[0], "", seed, 0.5)
+        .drop(columns="score")
+        # Before the first update nothing was sampled, but the buffer has rows.
+        .assign(**{key: [None, 0.2 + 0.2 * seed] for key in goals.SAMPLED})
+        .assign(positive_fraction_buffer=[0.0, 0.2 + 0.2 * seed])
+        for seed in range(2)
+    )
+    for arm in goals.ARMS:
+        if (rows := goals.sampled(said, arm)) is not None:
+            goals.add(rows.assign(method=arm), goals.sampled_of(kept))
+    per, mpfa = goals.tables(kept).split("\n\n")[-1].splitlines()[2:]
+    assert per == f"| {TASKS[0]} | {goals.PER} |" + "  |" * 5 + " 0.300 |"
+    assert mpfa == f"| {TASKS[0]} | {goals.MPFA} |" + " 0.300 |" * 6
