@@ -3,6 +3,7 @@
     python -m benchmarks.goals search             choose the settings, by HER on seeds of its own
     python -m benchmarks.goals                    make the runs, write docs/results/goals.csv, and
                                                   what was sampled into goals_replay.csv beside it
+    python -m benchmarks.goals parts              the same of its parts in mazes, exploratory
     python -m benchmarks.goals --kept             print the tables of the kept rows
     python -m benchmarks.goals --tasks FetchReach-v4 --seeds 100 101
 
@@ -42,6 +43,13 @@ ARMS: Final[Mapping[str, Sequence[str]]] = {
     "half batches with hindsight": ["--replay", "uniform_halves", *HINDSIGHT],
 }
 """What an arm says beside the settings of the task."""
+PARTS: Final[Mapping[str, Sequence[str]]] = {
+    "MPFA-PER, neither raised nor decayed": ["--replay", "mpf_per", *HINDSIGHT],
+    "reward and TD error": ["--replay", "td_reward", *HINDSIGHT],
+    "TD error and action gradient": ["--replay", "td_loss", *HINDSIGHT],
+    "PER, raised": ["--replay", "raise", *HINDSIGHT],
+}
+"""Parts of MPFA-PER with hindsight."""
 STEPS: Final[Mapping[str, int]] = {
     "FetchReach-v4": 5_000,
     "PointMaze_UMaze-v3": 30_000,
@@ -100,7 +108,7 @@ def run(
 
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
-    own = [*ARMS[arm], "--folder", str(folder)]
+    own = [*{**ARMS, **PARTS}[arm], "--folder", str(folder)]
     if arm == MPFA and task in POSITIVE:
         own.append(f"--positive-above={POSITIVE[task]}")
     made = page.main([*words, *own])
@@ -119,9 +127,11 @@ def sampled(said: pd.DataFrame, arm: str) -> pd.DataFrame | None:
     return said.reindex(columns=[*COLUMNS[:-1], *of_arm]).reindex(columns=[*COLUMNS[:-1], *SAMPLED])
 
 
-def make(tasks: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path) -> None:
+def make(
+    tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path
+) -> None:
     """Make the runs without rows, seed by seed, and keep the rows of each."""
-    for seed, task, arm in product(seeds, tasks, (*ARMS, SB3)):
+    for seed, task, arm in product(seeds, tasks, arms):
         if arm == SB3 and seed not in SB3_SEEDS:
             continue
         if missing(rows_of(kept, task), arm, [seed]):
@@ -191,8 +201,9 @@ def planned_differences(of_runs: pd.DataFrame) -> str:
     areas_of = of_runs[of_runs["task"].isin(PLANNED) & of_runs["method"].isin(list(ARMS))]
     runs = areas_of.pivot_table("area", "seed", ["method", "task"])
     runs = runs.reindex(columns=pd.MultiIndex.from_product([list(ARMS), PLANNED]))
-    if runs.isna().any(axis=None):
-        names = [f"{arm} on {task}" for (arm, task), gap in runs.isna().any().items() if gap]
+    short = runs.isna().any() | (not len(runs))
+    if short.any():
+        names = [f"{arm} on {task}" for (arm, task), lacks in short.items() if lacks]
         return f"The planned comparisons need more runs: {', '.join(names)}."
     mean = runs.T.groupby(level=0).mean()
 
@@ -209,7 +220,7 @@ def planned_differences(of_runs: pd.DataFrame) -> str:
 def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
     """Return a task's areas and last scores: means, their intervals, and each run."""
     task, lines = rows["task"].iloc[0], []
-    for arm in [name for name in (*ARMS, SB3) if (rows["method"] == name).any()]:
+    for arm in [name for name in (*ARMS, SB3, *PARTS) if (rows["method"] == name).any()]:
         own = of_runs[(of_runs["task"] == task) & (of_runs["method"] == arm)]["area"].to_numpy()
         of_arm = rows[rows["method"] == arm].sort_values("steps")
         last = of_arm.groupby("seed")["score"].last().to_numpy()
@@ -238,19 +249,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", nargs="?", choices=["runs", "search"], default="runs")
-    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), default=list(PLANNED))
+    parser.add_argument("what", nargs="?", choices=["runs", "search", "parts"], default="runs")
+    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), help="all, or the mazes")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--folder", type=Path, default=Path("runs/goals"), help="of the runs")
     parser.add_argument("--output", type=Path, help="of the rows")
     parser.add_argument("--kept", action="store_true", help="print tables of kept rows alone")
     options = parser.parse_args(arguments)
+    parts = options.what == "parts"
+    tasks = options.tasks or (PLANNED[1:] if parts else PLANNED)
     if options.what == "search":
-        print(search(options.tasks, options.folder / "search", options.output or SEARCHED))
+        print(search(tasks, options.folder / "search", options.output or SEARCHED))
         return 0
     kept = options.output or KEPT
     if not options.kept:
-        make(options.tasks, options.seeds, options.folder, kept)
+        arms = list(PARTS) if parts else [*ARMS, SB3]
+        make(tasks, arms, options.seeds, options.folder, kept)
     print(tables(kept))
     return 0
 

@@ -28,7 +28,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, int]]:
     def run(task: str, arm: str, seed: int, *_: Any) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         asked.append((task, arm, seed))
         scores = rows_of(task, arm, seed, 0.5)
-        said = scores.drop(columns="score").assign(**{"share/reward": 0.25})
+        said = scores.drop(columns="score").assign(**dict.fromkeys(goals.SAMPLED, 0.25))
         return scores, said if arm.startswith("MPFA") else None
 
     monkeypatch.setattr(goals, "run", run)
@@ -40,7 +40,8 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     made: list[tuple[str, str, int]], tmp_path: Path
 ) -> None:
     kept = tmp_path / "goals.csv"
-    goals.make(TASKS, [104, 105], tmp_path, kept)
+    every = [*goals.ARMS, goals.SB3]
+    goals.make(TASKS, every, [104, 105], tmp_path, kept)
     arms = {arm for task, arm, seed in made if (task, seed) == (TASKS[0], 104)}
     assert arms == {*goals.ARMS, goals.SB3}
     # Stable-Baselines3 has five seeds.
@@ -48,8 +49,29 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
     said = read_table(goals.sampled_of(kept))
     assert {*said["method"]} == {goals.MPFA} and len(said) == 2 * 2 * 2
-    goals.make(TASKS, [104, 105, 106], tmp_path, kept)
+    goals.make(TASKS, every, [104, 105, 106], tmp_path, kept)
     assert {seed for *_, seed in made[22:]} == {106}
+
+
+@pytest.mark.parametrize(
+    ("what", "arms"), [([], [*goals.ARMS, goals.SB3]), (["parts"], goals.PARTS)]
+)
+def test_command_makes_the_runs_of_its_arms(
+    made: list[tuple[str, str, int]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    what: list[str],
+    arms: list[str],
+) -> None:
+    task = "PointMaze_UMaze-v3"
+    output = str(tmp_path / "goals.csv")
+    goals.main([*what, "--tasks", task, "--seeds", "100", "--output", output])
+    assert made == [(task, arm, 100) for arm in arms]
+    said = capsys.readouterr().out
+    assert said.startswith("The planned comparisons need more runs")
+    assert [line.split(" | ")[0] for line in said.splitlines() if "one run" in line] == [
+        f"| {arm}" for arm in arms
+    ]
 
 
 def test_rows_of_a_run_take_the_place_of_rows_of_the_same_run(tmp_path: Path) -> None:
@@ -115,7 +137,7 @@ def test_planned_differences_wait_for_all_runs(kept: Path, task: str, seeds: lis
 
 def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
     pytest.importorskip("gymnasium_robotics", reason="goal tasks are of the extra robotics")
-    for arm, own in goals.ARMS.items():
+    for arm, own in {**goals.ARMS, **goals.PARTS}.items():
         words = goals.words_of("FetchReach-v4", 3, {"gamma": 0.95, "tau": 0.05, "noise": 0.1})
         options, task = goals.page.parse([*words, *own])
         task.env.close()
