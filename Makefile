@@ -52,6 +52,9 @@ NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simu
 EVALUATED = `$(BIN)/python -c "import sys; print('kinematic' if sys.version_info >= (3, 12) else 'wheels')"`
 PHYSICS = `$(BIN)/python -c "import sys; print('environment.physics=kinematic' * (sys.version_info >= (3, 12)))"`
 
+# Pip shows its progress where someone looks.
+INSTALL = quiet=-q; [ ! -t 1 ] || quiet=; $(BIN)/python -m pip install $$quiet
+
 help: ## Print this list
 	@echo "usage: make TARGET"
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
@@ -149,16 +152,16 @@ $(STAMP): pyproject.toml
 	  echo "== making $(VENV) with $$python"; \
 	  "$$python" -m venv --clear $(VENV) || exit 1; \
 	fi
-	@echo "== installing in $(VENV), silently; the first time this downloads PyTorch, some gigabytes"
+	@echo "== installing in $(VENV); the first time this downloads PyTorch, some gigabytes"
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip uninstall -qq -y torch)
-	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip install -q $(TORCH_INSTALL_ARGS))
+	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(INSTALL) $(TORCH_INSTALL_ARGS))
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@printf '%s\n' '$(subst ','\'',$(TORCH_INSTALL_ARGS))' > $(TORCH))
 	@# Pip before 23.1, which comes with Python 3.10, does not find versions that fit each other.
-	@$(BIN)/python -m pip install -q 'pip>=23.1'
-	@$(BIN)/python -m pip install -q -e ".[examples]"
+	@$(INSTALL) 'pip>=23.1'
+	@$(INSTALL) -e ".[examples]"
 	@touch $(STAMP)
 
 $(DEV): $(STAMP)
-	@echo "== installing what tests and checks need in $(VENV), silently"
-	@$(BIN)/python -m pip install -q -e ".[dev]"
+	@echo "== installing what tests and checks need in $(VENV)"
+	@$(INSTALL) -e ".[dev]"
 	@touch $(DEV)

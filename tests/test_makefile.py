@@ -54,14 +54,22 @@ def add_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def make(
+    folder: Path, *arguments: str, stdout: int = subprocess.PIPE
+) -> subprocess.CompletedProcess[str]:
     # These tests may themselves run under make, which hands its flags on.
     dropped = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHON", "ARGS", "SLOW", "EPISODES")
     environment = {k: v for k, v in os.environ.items() if k not in dropped}
     environment["PATH"] = str(folder / "bin")
     assert MAKE is not None
     return subprocess.run(
-        [MAKE, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        [MAKE, *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
     )
 
 
@@ -194,6 +202,17 @@ def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: 
     assert done.returncode == 0
     assert len(pip_calls(copy)) == 4
     assert "making .venv" not in done.stdout  # The environment itself is kept.
+
+
+def test_pip_shows_its_progress_where_someone_looks(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    screen, end = os.openpty()
+    assert make(copy, ".venv/.installed-dev", stdout=end).returncode == 0
+    for opened in (screen, end):
+        os.close(opened)
+    assert [line.replace(" -q", "") for line in (NEW_PIP, SCRIPTS, REST)] == [
+        *(copy / "pip.log").read_text().splitlines()
+    ]
 
 
 def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: Path) -> None:
