@@ -166,10 +166,21 @@ def plot_mujoco(path: Path) -> None:
     plot_scores(runs_by_task([KEPT / "mujoco.csv"]), path, columns=1)
 
 
-def plot_half_cheetah(path: Path) -> None:
-    """Plot the scores of the only task of MuJoCo that so few steps are enough for."""
-    name = "HalfCheetah-v5"
-    plot_scores({name: runs_by_task([KEPT / "mujoco.csv"])[name]}, path)
+def plot_goals(path: Path) -> None:
+    """Plot the share of goals reached in each task of gymnasium-robotics over the steps."""
+    from benchmarks.goals import ARMS, PLANNED, SB3
+
+    tasks = runs_by_task([KEPT / "goals.csv"])
+    figure, (*axes, names) = new_figure(2, 2, panel=(3.5, 2.9))
+    for axis, task in zip(axes, PLANNED, strict=True):
+        curves = {arm: list(tasks[task][arm].values()) for arm in (*ARMS, SB3)}
+        draw_seeds(axis, curves, limits=(0.0, 1.0))
+        axis.set(xlabel="steps", ylabel="episodes at their goal", title=task)
+        # Names are the same in all of them.
+        axis.get_legend().remove()
+    names.axis("off")
+    names.legend(*axes[-1].get_legend_handles_labels(), loc="center", frameon=False)
+    finish(figure, axes, path)
 
 
 def plot_sparse(path: Path) -> None:
@@ -192,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     images = {
         "cliffwalk": plot_cliffwalk,
         "mujoco": plot_mujoco,
-        "half_cheetah": plot_half_cheetah,
+        "goals": plot_goals,
         "sparse": plot_sparse,
     }
     known = [*PANELS, *images]
