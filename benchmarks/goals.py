@@ -3,9 +3,9 @@
     python -m benchmarks.goals search             choose the settings, by HER on seeds of its own
     python -m benchmarks.goals                    make the runs, write docs/results/goals.csv, and
                                                   what was sampled into goals_replay.csv beside it
-    python -m benchmarks.goals parts              the same of its parts in mazes, exploratory
+    python -m benchmarks.goals exploratory        the same of arms that show why
     python -m benchmarks.goals --kept             print the tables of the kept rows
-    python -m benchmarks.goals --tasks FetchReach-v4 --seeds 100 101
+    python -m benchmarks.goals --tasks FetchReach-v4 --arms HER uniform --seeds 100 101
 
 Runs are those of ``examples/gymnasium_td3.py``, and for *SB3's HER* of Stable-Baselines3's TD3 with
 its own buffer. A run has its rows in the file as soon as it has ended, and is not made again: the
@@ -43,13 +43,16 @@ ARMS: Final[Mapping[str, Sequence[str]]] = {
     "half batches with hindsight": ["--replay", "uniform_halves", *HINDSIGHT],
 }
 """What an arm says beside the settings of the task."""
-PARTS: Final[Mapping[str, Sequence[str]]] = {
+RAISED = "PER, raised"
+EXPLORATORY: Final[Mapping[str, Sequence[str]]] = {
     "MPFA-PER, neither raised nor decayed": ["--replay", "mpf_per", *HINDSIGHT],
     "reward and TD error": ["--replay", "td_reward", *HINDSIGHT],
     "TD error and action gradient": ["--replay", "td_loss", *HINDSIGHT],
-    "PER, raised": ["--replay", "raise", *HINDSIGHT],
+    RAISED: ["--replay", "raise", *HINDSIGHT],
+    "HER, two updates a step": ["--replay", "her", "--updates", "2"],
 }
-"""Parts of MPFA-PER with hindsight."""
+"""Parts of MPFA-PER with hindsight, and as many updates as half batches have."""
+EVERY: Final = {**ARMS, SB3: (), **EXPLORATORY}
 STEPS: Final[Mapping[str, int]] = {
     "FetchReach-v4": 5_000,
     "PointMaze_UMaze-v3": 30_000,
@@ -108,8 +111,8 @@ def run(
 
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
-    own = [*{**ARMS, **PARTS}[arm], "--folder", str(folder)]
-    if arm == MPFA and task in POSITIVE:
+    own = [*EVERY[arm], "--folder", str(folder)]
+    if arm in (MPFA, RAISED) and task in POSITIVE:
         own.append(f"--positive-above={POSITIVE[task]}")
     made = page.main([*words, *own])
     scores, said = (
@@ -127,14 +130,11 @@ def sampled(said: pd.DataFrame, arm: str) -> pd.DataFrame | None:
     return said.reindex(columns=[*COLUMNS[:-1], *of_arm]).reindex(columns=[*COLUMNS[:-1], *SAMPLED])
 
 
-def make(
-    tasks: Sequence[str], arms: Sequence[str], seeds: Sequence[int], folder: Path, kept: Path
-) -> None:
+def make(tasks: Sequence[str], arms: Mapping[str, Sequence[int]], folder: Path, kept: Path) -> None:
     """Make the runs without rows, seed by seed, and keep the rows of each."""
-    for seed, task, arm in product(seeds, tasks, arms):
-        if arm == SB3 and seed not in SB3_SEEDS:
-            continue
-        if missing(rows_of(kept, task), arm, [seed]):
+    every = sorted({seed for seeds in arms.values() for seed in seeds})
+    for seed, task, arm in product(every, tasks, arms):
+        if seed in arms[arm] and missing(rows_of(kept, task), arm, [seed]):
             scores, said = run(task, arm, seed, CHOSEN[task], folder)
             if said is not None:
                 add(said, sampled_of(kept))
@@ -220,7 +220,7 @@ def planned_differences(of_runs: pd.DataFrame) -> str:
 def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
     """Return a task's areas and last scores: means, their intervals, and each run."""
     task, lines = rows["task"].iloc[0], []
-    for arm in [name for name in (*ARMS, SB3, *PARTS) if (rows["method"] == name).any()]:
+    for arm in [name for name in EVERY if (rows["method"] == name).any()]:
         own = of_runs[(of_runs["task"] == task) & (of_runs["method"] == arm)]["area"].to_numpy()
         of_arm = rows[rows["method"] == arm].sort_values("steps")
         last = of_arm.groupby("seed")["score"].last().to_numpy()
@@ -249,22 +249,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", nargs="?", choices=["runs", "search", "parts"], default="runs")
-    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), help="all, or the mazes")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument(
+        "what", nargs="?", choices=["runs", "search", "exploratory"], default="runs"
+    )
+    parser.add_argument("--tasks", nargs="+", choices=list(STEPS), default=list(PLANNED))
+    parser.add_argument("--arms", nargs="+", choices=list(EVERY), help="in place of all")
+    parser.add_argument("--seeds", nargs="+", type=int, help="in place of those of the design")
     parser.add_argument("--folder", type=Path, default=Path("runs/goals"), help="of the runs")
     parser.add_argument("--output", type=Path, help="of the rows")
     parser.add_argument("--kept", action="store_true", help="print tables of kept rows alone")
     options = parser.parse_args(arguments)
-    parts = options.what == "parts"
-    tasks = options.tasks or (PLANNED[1:] if parts else PLANNED)
     if options.what == "search":
-        print(search(tasks, options.folder / "search", options.output or SEARCHED))
+        print(search(options.tasks, options.folder / "search", options.output or SEARCHED))
         return 0
     kept = options.output or KEPT
     if not options.kept:
-        arms = list(PARTS) if parts else [*ARMS, SB3]
-        make(tasks, arms, options.seeds, options.folder, kept)
+        usual = EXPLORATORY if options.what == "exploratory" else [*ARMS, SB3]
+        seeds = {SB3: SB3_SEEDS} if options.seeds is None else {}
+        arms = {arm: seeds.get(arm, options.seeds or SEEDS) for arm in options.arms or usual}
+        make(options.tasks, arms, options.folder, kept)
     print(tables(kept))
     return 0
 

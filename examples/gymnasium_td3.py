@@ -266,7 +266,7 @@ def train(options: argparse.Namespace, task: Task) -> pd.DataFrame:
                 replay.buffer,
                 learner,
                 replay.select,
-                updates=STEPS_A_ROUND,
+                updates=STEPS_A_ROUND * options.updates,
                 prepare=scale.normalize,
             )
         if done % options.every < STEPS_A_ROUND:
@@ -295,6 +295,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--start", type=int, default=5_000, help="steps at random before learning")
     parser.add_argument("--every", type=int, default=5_000, help="steps between evaluations")
+    parser.add_argument("--updates", type=int, default=1, help="for each step")
     parser.add_argument("--batch-size", type=int, default=100)
     parser.add_argument("--width", type=int, default=256, help="units of a layer")
     parser.add_argument("--gamma", type=float, default=0.99)
@@ -308,6 +309,8 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
         parser.error(f"--start must be at least {least}, got {options.start}")
     if not STEPS_A_ROUND <= options.every <= options.steps:
         parser.error(f"--every must be in {STEPS_A_ROUND} to {options.steps}, got {options.every}")
+    if options.updates < 1:
+        parser.error(f"--updates must be at least 1, got {options.updates}")
     if options.start >= options.steps:
         parser.error(f"--steps must be more than --start = {options.start}, got {options.steps}")
     if not 0 <= options.seed < 2**32:
@@ -330,6 +333,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
     if method.hindsight and not task.has_goal:
         parser.error(f"--replay must be one without hindsight, as {options.task} has no goals")
     options.name = options.replay + (f"-hindsight{options.hindsight}" if options.hindsight else "")
+    options.name += f"-updates{options.updates}" if options.updates > 1 else ""
     return options, task
 
 

@@ -40,21 +40,25 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     made: list[tuple[str, str, int]], tmp_path: Path
 ) -> None:
     kept = tmp_path / "goals.csv"
-    every = [*goals.ARMS, goals.SB3]
-    goals.make(TASKS, every, [104, 105], tmp_path, kept)
+    every = {arm: [104, 105] for arm in goals.ARMS} | {goals.SB3: [104]}
+    goals.make(TASKS, every, tmp_path, kept)
     arms = {arm for task, arm, seed in made if (task, seed) == (TASKS[0], 104)}
     assert arms == {*goals.ARMS, goals.SB3}
-    # Stable-Baselines3 has five seeds.
     assert {arm for task, arm, seed in made if seed == 105} == {*goals.ARMS}
     assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
     said = read_table(goals.sampled_of(kept))
     assert {*said["method"]} == {goals.MPFA} and len(said) == 2 * 2 * 2
-    goals.make(TASKS, every, [104, 105, 106], tmp_path, kept)
+    goals.make(TASKS, {arm: [*seeds, 106] for arm, seeds in every.items()}, tmp_path, kept)
     assert {seed for *_, seed in made[22:]} == {106}
 
 
 @pytest.mark.parametrize(
-    ("what", "arms"), [([], [*goals.ARMS, goals.SB3]), (["parts"], goals.PARTS)]
+    ("what", "arms"),
+    [
+        ([], [*goals.ARMS, goals.SB3]),
+        (["exploratory"], list(goals.EXPLORATORY)),
+        (["--arms", "HER", goals.SB3], ["HER", goals.SB3]),
+    ],
 )
 def test_command_makes_the_runs_of_its_arms(
     made: list[tuple[str, str, int]],
@@ -65,13 +69,22 @@ def test_command_makes_the_runs_of_its_arms(
 ) -> None:
     task = "PointMaze_UMaze-v3"
     output = str(tmp_path / "goals.csv")
-    goals.main([*what, "--tasks", task, "--seeds", "100", "--output", output])
-    assert made == [(task, arm, 100) for arm in arms]
+    goals.main([*what, "--tasks", task, "--seeds", "902", "--output", output])
+    assert made == [(task, arm, 902) for arm in arms]
     said = capsys.readouterr().out
     assert said.startswith("The planned comparisons need more runs")
     assert [line.split(" | ")[0] for line in said.splitlines() if "one run" in line] == [
         f"| {arm}" for arm in arms
     ]
+
+
+def test_command_makes_runs_of_the_seeds_of_the_design_where_none_are_named(
+    made: list[tuple[str, str, int]], tmp_path: Path
+) -> None:
+    output = ["--output", str(tmp_path / "goals.csv")]
+    goals.main(["--tasks", "PointMaze_UMaze-v3", "--arms", "HER", goals.SB3, *output])
+    seeds = {arm: [seed for _, of, seed in made if of == arm] for arm in ("HER", goals.SB3)}
+    assert seeds == {"HER": [*range(100, 110)], goals.SB3: [*range(100, 105)]}
 
 
 def test_rows_of_a_run_take_the_place_of_rows_of_the_same_run(tmp_path: Path) -> None:
@@ -137,12 +150,13 @@ def test_planned_differences_wait_for_all_runs(kept: Path, task: str, seeds: lis
 
 def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
     pytest.importorskip("gymnasium_robotics", reason="goal tasks are of the extra robotics")
-    for arm, own in {**goals.ARMS, **goals.PARTS}.items():
+    for arm, own in {**goals.ARMS, **goals.EXPLORATORY}.items():
         words = goals.words_of("FetchReach-v4", 3, {"gamma": 0.95, "tau": 0.05, "noise": 0.1})
         options, task = goals.page.parse([*words, *own])
         task.env.close()
         assert (options.steps, options.every, options.width, options.seed) == (5_000, 250, 64, 3)
-        assert (options.hindsight is None) == (arm in ("uniform", "HER"))
+        assert (options.hindsight is None) == (options.replay in ("uniform", "her"))
+        assert options.updates == (2 if arm == "HER, two updates a step" else 1)
 
 
 def test_what_was_sampled_is_a_mean_over_evaluations_after_updates_and_runs(kept: Path) -> None:

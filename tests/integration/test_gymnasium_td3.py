@@ -106,6 +106,7 @@ def test_action_reaches_the_whole_range_of_the_task() -> None:
     [
         (["--start", "99"], "--start must be at least one batch of 100, got 99"),
         (["--every", "300", "--steps", "200"], "--every must be in 10 to 200, got 300"),
+        (["--updates", "0"], "--updates must be at least 1, got 0"),
         (["--replay", "rud"], "invalid choice: 'rud'"),
         (["--task", PENDULUM, "--replay", "her"], f"without hindsight, as {PENDULUM} has no goals"),
         (["--task", PENDULUM, "--hindsight", "2"], f"without hindsight, as {PENDULUM} has no"),
@@ -291,6 +292,28 @@ def test_hindsight_adds_rows_and_another_method_takes_it_too(
         assert "achieved_goal" not in replay.buffer[:]["next"].keys()  # noqa: SIM118
     names = {row["method"] for folder in tmp_path.iterdir() for row in scores_in(folder)}
     assert names == {"td3/uniform", "td3/her", "td3/per-hindsight2"}
+
+
+def test_each_step_has_as_many_updates_as_were_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    run = mpfa.run_updates
+    monkeypatch.setattr(
+        mpfa,
+        "run_updates",
+        lambda *words, updates, **given: (
+            made.append(updates),
+            run(*words, updates=updates, **given),
+        )[1],
+    )
+    monkeypatch.setattr(gymnasium_td3, "EPISODES", 1)
+    short = ["--task", POINT, "--steps", "40", "--start", "20", "--every", "40", "--eager"]
+    short += ["--batch-size", "16", "--width", "8", "--folder", str(tmp_path), "--replay", "her"]
+    folders = [gymnasium_td3.main(short), gymnasium_td3.main([*short, "--updates", "3"])]
+    # Two rounds of ten steps learn.
+    assert made == [10, 10, 30, 30]
+    assert folders[1].name == f"{folders[0].name.removesuffix('-0')}-updates3-0"
 
 
 @pytest.mark.slow
