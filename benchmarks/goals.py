@@ -3,8 +3,9 @@
     python -m benchmarks.goals search             choose the settings, by HER on seeds of its own
     python -m benchmarks.goals                    make the runs, write docs/results/goals.csv, and
                                                   what was sampled into goals_replay.csv beside it
-    python -m benchmarks.goals exploratory        the same of arms that show why
     python -m benchmarks.goals --kept             print the tables of the kept rows
+    python -m benchmarks.goals exploratory        the same of arms that show why, with rows in
+                                                  goals_exploratory.csv
     python -m benchmarks.goals --tasks FetchReach-v4 --arms HER uniform --seeds 100 101
 
 Runs are those of ``examples/gymnasium_td3.py``, and for *SB3's HER* of Stable-Baselines3's TD3 with
@@ -32,7 +33,7 @@ from training.records import area_under, read_table, write_table
 from training.statistics import mean_interval
 
 KEPT = Path(__file__).parents[1] / "docs" / "results" / "goals.csv"
-SEARCHED = KEPT.with_name("goals_search.csv")
+SEARCHED, EXPLORED = (KEPT.with_name(f"goals_{name}.csv") for name in ("search", "exploratory"))
 SB3, PER, MPFA = "SB3's HER", "PER with hindsight", "MPFA-PER with hindsight"
 HINDSIGHT = ["--hindsight", "4"]
 ARMS: Final[Mapping[str, Sequence[str]]] = {
@@ -232,6 +233,27 @@ def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
     return table(["arm", "area", "95 %", "at the end", "95 %", "area of each run"], lines)
 
 
+def explored_table(explored: Path = EXPLORED, kept: Path = KEPT) -> str:
+    """Return mean areas of exploratory arms in each task, beside those of the design.
+
+    Seeds are those of which each exploratory arm has a run.
+    """
+    by_run, found = ["task", "seed"], [areas(read_table(file)) for file in (explored, kept)]
+    ours, beside = (rows.pivot(index=by_run, columns="method", values="area") for rows in found)
+    runs = ours.dropna().join(beside).dropna(axis=1, how="all")
+    tasks = [task for task in STEPS if task in runs.index]
+    lines = []
+    for arm in [name for name in {**ARMS, **EXPLORATORY} if name in runs]:
+        line = [arm]
+        for task in tasks:
+            own = runs.loc[task][arm].dropna().to_numpy()
+            middle = mean_interval(own) if len(own) else None
+            line += [number(middle.value), interval(middle, [own], number)] if middle else ["", ""]
+        lines.append(line)
+    heads = [head for task in tasks for head in (f"{task}, {len(runs.loc[task])} runs", "95 %")]
+    return table(["arm", *heads], lines)
+
+
 def sampled_table(rows: pd.DataFrame) -> str:
     """Return what was sampled in each task: means over evaluations after updates, and runs."""
     learned = rows.dropna(subset="effective_sample_size")
@@ -262,13 +284,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.what == "search":
         print(search(options.tasks, options.folder / "search", options.output or SEARCHED))
         return 0
-    kept = options.output or KEPT
+    exploratory = options.what == "exploratory"
+    kept = options.output or (EXPLORED if exploratory else KEPT)
     if not options.kept:
-        usual = EXPLORATORY if options.what == "exploratory" else [*ARMS, SB3]
+        usual = EXPLORATORY if exploratory else [*ARMS, SB3]
         seeds = {SB3: SB3_SEEDS} if options.seeds is None else {}
         arms = {arm: seeds.get(arm, options.seeds or SEEDS) for arm in options.arms or usual}
         make(options.tasks, arms, options.folder, kept)
-    print(tables(kept))
+    print(explored_table(kept) if exploratory else tables(kept))
     return 0
 
 

@@ -12,6 +12,7 @@ from benchmarks import goals
 from training.comparison.scores import COLUMNS
 from training.records import read_table, write_table
 
+ROOT = Path(__file__).resolve().parents[2]
 TASKS = list(goals.STEPS)[:2]
 
 
@@ -72,7 +73,7 @@ def test_command_makes_the_runs_of_its_arms(
     goals.main([*what, "--tasks", task, "--seeds", "902", "--output", output])
     assert made == [(task, arm, 902) for arm in arms]
     said = capsys.readouterr().out
-    assert said.startswith("The planned comparisons need more runs")
+    assert ("The planned comparisons need more runs" in said) == ("exploratory" not in what)
     assert [line.split(" | ")[0] for line in said.splitlines() if "one run" in line] == [
         f"| {arm}" for arm in arms
     ]
@@ -137,6 +138,31 @@ def test_planned_differences_are_of_the_means_over_the_tasks(kept: Path) -> None
     assert len(table) == 4
     assert others[::2] == [f"## {task}" for task in goals.STEPS]
     assert others[1].splitlines()[-1].startswith(f"| {goals.SB3} | 0.750 |")
+
+
+def test_exploratory_arms_are_beside_those_of_the_design_with_the_same_seeds(
+    kept: Path, tmp_path: Path
+) -> None:
+    # Of the last seed one arm has no run yet.
+    rows = [
+        rows_of(TASKS[1], arm, seed, 0.4)
+        for seed in (2, 3, 4)
+        for arm in list(goals.EXPLORATORY)[: 4 if seed == 4 else None]
+    ]
+    write_table(pd.concat(rows), tmp_path / "explored.csv")
+    head, _, *lines = goals.explored_table(tmp_path / "explored.csv", kept).splitlines()
+    assert head == f"| arm | {TASKS[1]}, 2 runs | 95 % |"
+    means = {line.split(" | ")[0][2:]: float(line.split(" | ")[1]) for line in lines}
+    assert means.keys() == {*goals.ARMS, *goals.EXPLORATORY}
+    # Of the design PER has 0.4 and a thousandth for each seed.
+    assert means[goals.PER] == pytest.approx(0.75 * (0.4 + 0.0025), abs=6e-4)
+    assert means[goals.RAISED] == pytest.approx(0.75 * 0.4, abs=6e-4)
+
+
+def test_page_has_the_tables_of_the_kept_rows() -> None:
+    page = (ROOT / "docs/results/goals.md").read_text(encoding="utf-8")
+    for part in goals.tables().split("\n\n"):
+        assert part in page or part == "## What was sampled"
 
 
 @pytest.mark.parametrize(("task", "seeds"), [("PointMaze_UMaze-v3", [3]), (TASKS[0], range(8))])
