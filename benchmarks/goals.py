@@ -51,8 +51,9 @@ EXPLORATORY: Final[Mapping[str, Sequence[str]]] = {
     "TD error and action gradient": ["--replay", "td_loss", *HINDSIGHT],
     RAISED: ["--replay", "raise", *HINDSIGHT],
     "HER, two updates a step": ["--replay", "her", "--updates", "2"],
+    "HER, eight goals an episode": ["--replay", "her", "--hindsight", "8"],
 }
-"""Parts of MPFA-PER with hindsight, and as many updates as half batches have."""
+"""Parts of MPFA-PER with hindsight, as many updates as half batches have, and more goals."""
 EVERY: Final = {**ARMS, SB3: (), **EXPLORATORY}
 STEPS: Final[Mapping[str, int]] = {
     "FetchReach-v4": 5_000,
