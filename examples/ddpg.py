@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
     collected, best, most = 0, policy_of(actor), 0.0
     outcomes: deque[bool] = deque(maxlen=100)
-    with tqdm(total=options.actions, unit="action", smoothing=0.05) as bar:
+    with tqdm(desc="train", total=options.actions, unit="action", smoothing=0.05) as bar:
         for steps in collector:  # [ROBOTS, STEPS]
             buffer.extend(steps.reshape(-1))
             if len(buffer) >= BATCH_SIZE:

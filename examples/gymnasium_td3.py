@@ -37,7 +37,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
-from tqdm import trange
+from tqdm import tqdm
 
 import torchrl_mpfa as mpfa
 from torchrl_mpfa.methods import loss_options, make_replay, method_named
@@ -253,7 +253,9 @@ def train(options: argparse.Namespace, task: Task) -> pd.DataFrame:
     scale = Scale(task.observations, moves=task.has_goal)
     acts = Acts(actor, scale)
     rows: list[dict[str, object]] = []
-    for done in (bar := trange(STEPS_A_ROUND, options.steps + 1, STEPS_A_ROUND, unit="round")):
+    rounds = range(STEPS_A_ROUND, options.steps + 1, STEPS_A_ROUND)
+    bar = tqdm(rounds, f"{options.task} {options.name}", unit="step", unit_scale=STEPS_A_ROUND)
+    for done in bar:
         learning = done > options.start
         found = collect(task, acts if learning else None, source, noise=options.noise)
         scale.see(found["observation"])

@@ -231,7 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> Actor:
 
     robots, states, collected = env.reset(), torch.zeros(ROBOTS, WIDTH), 0
     outcomes: deque[bool] = deque(maxlen=200)
-    with tqdm(total=options.actions, unit="action", smoothing=0.05) as bar:
+    with tqdm(desc="train", total=options.actions, unit="action", smoothing=0.05) as bar:
         while collected < options.actions:
             done = collected / options.actions
             steps, robots, states = drive(

@@ -36,11 +36,14 @@ if _missing:
 # which takes a fifth of the imports' time.
 gc.set_threshold(100_000, 50, 50)
 _status: list[int] = []
+_is_first = "multiprocessing.util" not in sys.modules
+"""What was imported before registered its own end before: it has to come to that by itself."""
 
 
 def end_with(status: int) -> None:
     """Have the process end with a status once all that was registered for its end is done."""
-    _status.append(status)
+    if _is_first:
+        _status.append(status)
 
 
 @atexit.register  # Before all others, hence called after them.

@@ -97,3 +97,17 @@ def test_threads_that_ask_at_once_for_what_is_imported_later_all_get_it() -> Non
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("first", ["training.extra", "multiprocessing.util"])
+def test_what_was_imported_before_the_scripts_parts_comes_to_its_own_end(first: str) -> None:
+    code = (
+        f"import {first}, atexit, multiprocessing, os, sys\n"
+        "from training.files import run_script\n"
+        "held = multiprocessing.get_context('spawn').Lock()\n"
+        "atexit.register(print, 'ended')\n"
+        "run_script(lambda: 3)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    # Of locks that were not given back Python's tracker would warn.
+    assert (done.returncode, done.stdout, done.stderr) == (3, "ended\n", "")

@@ -338,5 +338,5 @@ def _progress_bar(total: int | None) -> Iterator[Callable[[], object]]:
         return
     from tqdm import tqdm
 
-    with closing(tqdm(total=total, unit="episode")) as bar:
+    with closing(tqdm(desc="evaluate", total=total, unit="episode")) as bar:
         yield bar.update

@@ -101,7 +101,12 @@ class Progress(Hook):
         """Show the bar."""
         done = run.schedule
         self._bar = tqdm(
-            total=done.total, initial=done.done, unit=done.unit, smoothing=0, disable=None
+            desc="train",
+            total=done.total,
+            initial=done.done,
+            unit=done.unit,
+            smoothing=0,
+            disable=None,
         )
 
     def on_iteration(self, run: TrainingRun) -> None:
