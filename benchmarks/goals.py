@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +27,7 @@ import pandas as pd
 import gymnasium_td3 as page
 from benchmarks.planned import Planned, planned_table
 from benchmarks.rivals import missing
+from torchrl_mpfa import METHODS
 from training.comparison.report import interval, number, table
 from training.comparison.scores import COLUMNS
 from training.files import run_script
@@ -44,12 +46,11 @@ ARMS: Final[Mapping[str, Sequence[str]]] = {
     "half batches with hindsight": ["--replay", "uniform_halves", *HINDSIGHT],
 }
 """What an arm says beside the settings of the task."""
-RAISED = "PER, raised"
 EXPLORATORY: Final[Mapping[str, Sequence[str]]] = {
     "MPFA-PER, neither raised nor decayed": ["--replay", "mpf_per", *HINDSIGHT],
     "reward and TD error": ["--replay", "td_reward", *HINDSIGHT],
     "TD error and action gradient": ["--replay", "td_loss", *HINDSIGHT],
-    RAISED: ["--replay", "raise", *HINDSIGHT],
+    "PER, raised": ["--replay", "raise", *HINDSIGHT],
     "HER, two updates a step": ["--replay", "her", "--updates", "2"],
     "HER, eight goals an episode": ["--replay", "her", "--hindsight", "8"],
 }
@@ -65,7 +66,7 @@ STEPS: Final[Mapping[str, int]] = {
 PLANNED: Final = tuple(STEPS)[:3]
 """Tasks of the planned comparisons."""
 POSITIVE: Final[Mapping[str, float]] = {"FetchReach-v4": -0.5, "FetchPush-v4": -0.5}
-"""Level above which a reward is positive for MPFA-PER: a step costs 1 there until the goal."""
+"""Level above which a reward is positive: a step costs 1 there until the goal."""
 COMMON: Final = {"width": 64, "batch-size": 256, "start": 1_000}
 _FAST: Final = {"gamma": 0.98, "tau": 0.05, "noise": 0.3}
 CHOSEN: Final[Mapping[str, Mapping[str, float]]] = {
@@ -113,14 +114,20 @@ def run(
 
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
-    own = [*EVERY[arm], "--folder", str(folder)]
-    if arm in (MPFA, RAISED) and task in POSITIVE:
-        own.append(f"--positive-above={POSITIVE[task]}")
-    made = page.main([*words, *own])
+    made = page.main([*words, *words_of_arm(arm, task), "--folder", str(folder)])
     scores, said = (
         read_table(made / file).assign(**name) for file in (page.SCORES, page.STATISTICS)
     )
     return scores[list(COLUMNS)], sampled(said, arm)
+
+
+def words_of_arm(arm: str, task: str) -> list[str]:
+    """Return what an arm says, and above which reward is positive to a method that asks for it."""
+    words = [*EVERY[arm]]
+    asks = {field.name for field in fields(METHODS[words[1]])}
+    if task in POSITIVE and "positive_above" in asks:
+        words.append(f"--positive-above={POSITIVE[task]}")
+    return words
 
 
 def sampled(said: pd.DataFrame, arm: str) -> pd.DataFrame | None:

@@ -156,7 +156,7 @@ def test_exploratory_arms_are_beside_those_of_the_design_with_the_same_seeds(
     assert means.keys() == {*goals.ARMS, *goals.EXPLORATORY}
     # Of the design PER has 0.4 and a thousandth for each seed.
     assert means[goals.PER] == pytest.approx(0.75 * (0.4 + 0.0025), abs=6e-4)
-    assert means[goals.RAISED] == pytest.approx(0.75 * 0.4, abs=6e-4)
+    assert means["PER, raised"] == pytest.approx(0.75 * 0.4, abs=6e-4)
 
 
 def test_page_has_the_tables_of_the_kept_rows() -> None:
@@ -184,6 +184,17 @@ def test_words_of_a_run_are_those_of_the_page_for_every_arm() -> None:
         eight = arm == "HER, eight goals an episode"
         assert (options.hindsight is None) == (options.replay in ("uniform", "her") and not eight)
         assert options.updates == (2 if arm == "HER, two updates a step" else 1)
+
+
+def test_arms_that_weigh_by_what_is_positive_know_it_where_each_step_costs() -> None:
+    told = {
+        arm
+        for arm in {**goals.ARMS, **goals.EXPLORATORY}
+        if "--positive-above=-0.5" in goals.words_of_arm(arm, "FetchReach-v4")
+    }
+    assert told == {goals.MPFA, *list(goals.EXPLORATORY)[:4]}
+    for arm in told:
+        assert goals.words_of_arm(arm, "PointMaze_UMaze-v3") == [*goals.EVERY[arm]]
 
 
 def test_what_was_sampled_is_a_mean_over_evaluations_after_updates_and_runs(kept: Path) -> None:
