@@ -52,9 +52,17 @@ EXPLORATORY: Final[Mapping[str, Sequence[str]]] = {
     "TD error and action gradient": ["--replay", "td_loss", *HINDSIGHT],
     "PER, raised": ["--replay", "raise", *HINDSIGHT],
     "HER, two updates a step": ["--replay", "her", "--updates", "2"],
+    "HER, two updates of half a batch": [
+        "--replay",
+        "her",
+        "--updates",
+        "2",
+        "--batch-size",
+        "128",
+    ],
     "HER, eight goals an episode": ["--replay", "her", "--hindsight", "8"],
 }
-"""Parts of MPFA-PER with hindsight, as many updates as half batches have, and more goals."""
+"""Parts of MPFA-PER with hindsight, more updates, and more goals."""
 EVERY: Final = {**ARMS, SB3: (), **EXPLORATORY}
 STEPS: Final[Mapping[str, int]] = {
     "FetchReach-v4": 5_000,
