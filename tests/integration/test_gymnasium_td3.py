@@ -21,12 +21,13 @@ from torchrl_mpfa.methods.her import GymnasiumGoals
 from torchrl_mpfa.selection import SampledBatch
 
 PENDULUM = "Pendulum-v1"
-POINT = "tests/Point-v0"
+POINT, MAZE = "tests/Point-v0", "tests/PointLikeMazes-v0"
 
 
 class Point(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """A point in a square that is paid where it is near its goal, for ten steps."""
 
+    at_goal = "is_success"
     action_space = gymnasium.spaces.Box(-2.0, 2.0, (2,), np.float32)
     observation_space = gymnasium.spaces.Dict(
         {
@@ -53,15 +54,22 @@ class Point(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.place = np.clip(self.place + 0.1 * action, -1.0, 1.0).astype(np.float32)
         self.steps += 1
         reward = self.compute_reward(self.place, self.goal, {})
-        info = {"is_success": reward == 0.0}
+        info = {self.at_goal: reward == 0.0}
         return self.seen(), float(reward), False, self.steps == 10, info
 
     def compute_reward(self, achieved: np.ndarray, wanted: np.ndarray, info: Any) -> np.ndarray:
         return -(np.linalg.norm(achieved - wanted, axis=-1) > 0.3).astype(np.float64)
 
 
-if POINT not in gymnasium.registry:
-    gymnasium.register(POINT, Point)
+class PointLikeMazes(Point):
+    """The same, but that it is at its goal has the name that mazes give it."""
+
+    at_goal = "success"
+
+
+for name, task in ((POINT, Point), (MAZE, PointLikeMazes)):
+    if name not in gymnasium.registry:
+        gymnasium.register(name, task)
 
 
 def rounds_of(number: int) -> tuple[Task, TensorDictBase]:
@@ -204,12 +212,13 @@ class Towards:
         return np.clip(5.0 * (seen[3:] - seen[:2]).numpy(), -1.0, 1.0)
 
 
+@pytest.mark.parametrize("task", [POINT, MAZE])
 def test_the_score_of_a_goal_task_is_the_share_of_episodes_that_end_at_the_goal(
-    monkeypatch: pytest.MonkeyPatch,
+    task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gymnasium_td3, "EPISODES", 4)
-    assert score(POINT, Towards(leaves=False), seed=0) == 1.0
-    assert score(POINT, Towards(leaves=True), seed=0) == 0.0
+    assert score(task, Towards(leaves=False), seed=0) == 1.0
+    assert score(task, Towards(leaves=True), seed=0) == 0.0
 
 
 def test_the_score_of_another_task_is_the_mean_return(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -314,6 +323,53 @@ def test_each_step_has_as_many_updates_as_were_asked_for(
     # Two rounds of ten steps learn.
     assert made == [10, 10, 30, 30]
     assert folders[1].name == f"{folders[0].name.removesuffix('-0')}-updates3-0"
+
+
+def test_options_reach_what_they_are_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rounds: list[tuple[Any, float]] = []
+    tests: list[tuple[Any, int]] = []
+    betas: list[float] = []
+    made: list[Any] = []
+
+    def collects(task: Task, acts: Any, source: Any, *, noise: float) -> TensorDictBase:
+        rounds.append((acts, noise))
+        return collect(task, acts, source, noise=noise)
+
+    def tested(name: str, acts: Any, *, seed: int) -> float:
+        tests.append((acts, seed))
+        return 0.5
+
+    def updated(buffer: Any, learner: Any, *words: Any, **given: Any) -> Any:
+        betas.append(buffer.sampler.beta)
+        return run(buffer, learner, *words, **given)
+
+    run, learns = mpfa.run_updates, mpfa.ActorCritic
+    monkeypatch.setattr(gymnasium_td3, "collect", collects)
+    monkeypatch.setattr(gymnasium_td3, "score", tested)
+    monkeypatch.setattr(mpfa, "run_updates", updated)
+    monkeypatch.setattr(
+        mpfa,
+        "ActorCritic",
+        lambda *networks, **given: made.append(given) or learns(*networks, **given),
+    )
+    words = ["--steps", "60", "--start", "30", "--every", "60", "--batch-size", "16", "--eager"]
+    words += ["--gamma", "0.9", "--tau", "0.2", "--noise", "0.4", "--width", "8", "--seed", "3"]
+    gymnasium_td3.main(
+        ["--task", POINT, "--replay", "per", *words, "--folder", str(tmp_path), "--hindsight", "2"]
+    )
+    # The first steps are at random, all others by the policy with noise.
+    assert [acts is None for acts, _ in rounds] == [True] * 3 + [False] * 3
+    assert {noise for _, noise in rounds} == {0.4}
+    [given] = made
+    asked = {"gamma": 0.9, "tau": 0.2, "policy_delay": 2, "policy_noise": 0.2, "noise_clip": 0.5}
+    assert {name: given[name] for name in asked} == asked
+    # Tests have starts of their own, the same for all seeds.
+    [(acts, seed)] = tests
+    assert seed == 1_000_000 and acts is rounds[-1][0]
+    seen = torch.randn(5)
+    assert (acts(seen) == acts.actor.act(acts.scale(seen)).numpy()).all()
+    assert not torch.equal(acts.scale(seen), seen)
+    assert betas == sorted(betas) and betas[0] < betas[-1] == 1.0
 
 
 @pytest.mark.slow
