@@ -168,7 +168,7 @@ def plot_mujoco(path: Path) -> None:
 
 def plot_goals(path: Path) -> None:
     """Plot the share of goals reached in each task of gymnasium-robotics over the steps."""
-    from benchmarks.goals import ARMS, PLANNED, SB3
+    from benchmarks.goals.arms import ARMS, PLANNED, SB3
 
     tasks = runs_by_task([KEPT / "goals.csv"])
     figure, (*axes, names) = new_figure(2, 2, panel=(3.5, 2.9))

@@ -196,7 +196,7 @@ PAGES = [*(ROOT / "examples").glob("*.py")]
     [
         ({"torchrl_mpfa"}, {"torchrl_mpfa", "examples", "benchmarks", "tests"}),
         ({path.stem for path in PAGES if path.stem != "gymnasium_td3"}, {"tests"}),
-        # The runs of benchmarks/goals.py are those of the page.
+        # The runs of benchmarks/goals are those of the page.
         ({"gymnasium_td3"}, {"benchmarks", "tests"}),
         ({"benchmarks"}, {"benchmarks", "tests"}),
         # The source root of the navigation task is no package.

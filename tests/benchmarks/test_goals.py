@@ -9,12 +9,14 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from benchmarks import goals
+from benchmarks.goals import __main__ as command
+from benchmarks.goals import arms as known
+from benchmarks.goals import runs, tables
 from training.comparison.scores import COLUMNS
 from training.records import read_table, write_table
 
 ROOT = Path(__file__).resolve().parents[2]
-TASKS = list(goals.STEPS)[:2]
+TASKS = list(known.STEPS)[:2]
 
 
 def rows_of(task: str, arm: str, seed: int, height: float) -> pd.DataFrame:
@@ -33,11 +35,11 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, int]]:
         assert settings == {"gamma": len(task)}
         asked.append((task, arm, seed))
         scores = rows_of(task, arm, seed, 0.5)
-        said = scores.drop(columns="score").assign(**dict.fromkeys(goals.SAMPLED, 0.25))
+        said = scores.drop(columns="score").assign(**dict.fromkeys(tables.SAMPLED, 0.25))
         return scores, said if arm.startswith("MPFA") else None
 
-    monkeypatch.setattr(goals, "run", run)
-    monkeypatch.setattr(goals, "CHOSEN", {task: {"gamma": len(task)} for task in TASKS})
+    monkeypatch.setattr(runs, "run", run)
+    monkeypatch.setattr(runs, "CHOSEN", {task: {"gamma": len(task)} for task in TASKS})
     return asked
 
 
@@ -45,24 +47,24 @@ def test_each_run_is_made_once_and_its_rows_are_kept(
     made: list[tuple[str, str, int]], tmp_path: Path
 ) -> None:
     kept = tmp_path / "goals.csv"
-    every = {arm: [104, 105] for arm in goals.ARMS} | {goals.SB3: [104]}
-    goals.make(TASKS, every, tmp_path, kept)
+    every = {arm: [104, 105] for arm in known.ARMS} | {known.SB3: [104]}
+    runs.make(TASKS, every, tmp_path, kept)
     arms = {arm for task, arm, seed in made if (task, seed) == (TASKS[0], 104)}
-    assert arms == {*goals.ARMS, goals.SB3}
-    assert {arm for task, arm, seed in made if seed == 105} == {*goals.ARMS}
-    assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(goals.ARMS) + 1)
-    said = read_table(goals.sampled_of(kept))
-    assert {*said["method"]} == {goals.MPFA} and len(said) == 2 * 2 * 2
-    goals.make(TASKS, {arm: [*seeds, 106] for arm, seeds in every.items()}, tmp_path, kept)
+    assert arms == {*known.ARMS, known.SB3}
+    assert {arm for task, arm, seed in made if seed == 105} == {*known.ARMS}
+    assert len(made) == len(read_table(kept)) // 2 == 2 * (2 * len(known.ARMS) + 1)
+    said = read_table(tables.sampled_of(kept))
+    assert {*said["method"]} == {known.MPFA} and len(said) == 2 * 2 * 2
+    runs.make(TASKS, {arm: [*seeds, 106] for arm, seeds in every.items()}, tmp_path, kept)
     assert {seed for *_, seed in made[22:]} == {106}
 
 
 @pytest.mark.parametrize(
     ("what", "arms"),
     [
-        ([], [*goals.ARMS, goals.SB3]),
-        (["exploratory"], list(goals.EXPLORATORY)),
-        (["--arms", "HER", goals.SB3], ["HER", goals.SB3]),
+        ([], [*known.ARMS, known.SB3]),
+        (["exploratory"], list(known.EXPLORATORY)),
+        (["--arms", "HER", known.SB3], ["HER", known.SB3]),
     ],
 )
 def test_command_makes_the_runs_of_its_arms(
@@ -74,7 +76,7 @@ def test_command_makes_the_runs_of_its_arms(
 ) -> None:
     task = "PointMaze_UMaze-v3"
     output = str(tmp_path / "goals.csv")
-    goals.main([*what, "--tasks", task, "--seeds", "902", "--output", output])
+    command.main([*what, "--tasks", task, "--seeds", "902", "--output", output])
     assert made == [(task, arm, 902) for arm in arms]
     said = capsys.readouterr().out
     assert ("The planned comparisons need more runs" in said) == ("exploratory" not in what)
@@ -87,15 +89,15 @@ def test_command_makes_runs_of_the_seeds_of_the_design_where_none_are_named(
     made: list[tuple[str, str, int]], tmp_path: Path
 ) -> None:
     output = ["--output", str(tmp_path / "goals.csv")]
-    goals.main(["--tasks", "PointMaze_UMaze-v3", "--arms", "HER", goals.SB3, *output])
-    seeds = {arm: [seed for _, of, seed in made if of == arm] for arm in ("HER", goals.SB3)}
-    assert seeds == {"HER": [*range(100, 110)], goals.SB3: [*range(100, 105)]}
+    command.main(["--tasks", "PointMaze_UMaze-v3", "--arms", "HER", known.SB3, *output])
+    seeds = {arm: [seed for _, of, seed in made if of == arm] for arm in ("HER", known.SB3)}
+    assert seeds == {"HER": [*range(100, 110)], known.SB3: [*range(100, 105)]}
 
 
 def test_rows_of_a_run_take_the_place_of_rows_of_the_same_run(tmp_path: Path) -> None:
     kept = tmp_path / "kept.csv"
     for arm, height in (("HER", 0.1), ("uniform", 0.2), ("HER", 0.3)):
-        goals.add(rows_of(TASKS[0], arm, 100, height), kept)
+        runs.add(rows_of(TASKS[0], arm, 100, height), kept)
     found = read_table(kept)
     assert found["method"].tolist() == ["uniform"] * 2 + ["HER"] * 2
     assert found["score"].tolist() == [0.2, 0.2, 0.3, 0.3]
@@ -105,15 +107,15 @@ def test_candidates_of_the_search_are_ordered_by_their_mean_area(
     made: list[tuple[str, str, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run(task: str, arm: str, seed: int, settings: Any, *_: Any) -> pd.DataFrame:
-        assert arm == "HER" and seed in goals.SEARCH_SEEDS
+        assert arm == "HER" and seed in known.SEARCH_SEEDS
         # The largest area of one seed would choose another.
         heights = (0.9, 0.0) if settings["tau"] == 0.05 else (0.5, 0.5)
         height = settings["gamma"] * heights[seed - 900]
         return rows_of(task, arm, seed, height), None
 
-    monkeypatch.setattr(goals, "run", run)
-    said = goals.search(TASKS[:1], tmp_path, tmp_path / "search.csv").splitlines()
-    assert len(said) == len(goals.CANDIDATES)
+    monkeypatch.setattr(runs, "run", run)
+    said = runs.search(TASKS[:1], tmp_path, tmp_path / "search.csv").splitlines()
+    assert len(said) == len(known.CANDIDATES)
     assert said[0].startswith(f"{TASKS[0]}: gamma=0.98 tau=0.005")
     assert "gamma=0.95 tau=0.05" in said[-1]
 
@@ -121,21 +123,21 @@ def test_candidates_of_the_search_are_ordered_by_their_mean_area(
 @pytest.fixture
 def kept(tmp_path: Path) -> Path:
     """Rows of eight seeds, in which PER is ahead by a fifth of a score."""
-    heights = dict(zip(goals.ARMS, (0.1, 0.6, 0.8, 0.7, 0.65), strict=True))
+    heights = dict(zip(known.ARMS, (0.1, 0.6, 0.8, 0.7, 0.65), strict=True))
     rows = [
         rows_of(task, arm, seed, height * factor + 0.001 * seed)
-        for task, factor in zip(goals.PLANNED, (1.0, 0.5, 0.0), strict=True)
+        for task, factor in zip(known.PLANNED, (1.0, 0.5, 0.0), strict=True)
         for arm, height in heights.items()
         for seed in range(8)
     ]
     # What is beside them, and apart.
-    rows += [rows_of(TASKS[0], goals.SB3, 0, 1.0), rows_of("FetchPush-v4", "HER", 0, 1.0)]
+    rows += [rows_of(TASKS[0], known.SB3, 0, 1.0), rows_of("FetchPush-v4", "HER", 0, 1.0)]
     write_table(pd.concat(rows), tmp_path / "goals.csv")
     return tmp_path / "goals.csv"
 
 
 def test_planned_differences_are_of_the_means_over_the_tasks(kept: Path) -> None:
-    planned, *others = goals.tables(kept).split("\n\n")
+    planned, *others = tables.tables(kept).split("\n\n")
     table = planned.splitlines()[2:]
     # Three quarters of a score is the area of two equal ones that begin at zero.
     expected = (("PER with hindsight − HER", 0.2), ("MPFA-PER with hindsight − PER", -0.1))
@@ -143,8 +145,8 @@ def test_planned_differences_are_of_the_means_over_the_tasks(kept: Path) -> None
         assert line.startswith(f"| {name}")
         assert float(line.split("|")[3]) == pytest.approx(0.75 * 0.5 * gap, abs=0.002)
     assert len(table) == 4
-    assert others[::2] == [f"## {task}" for task in goals.STEPS]
-    assert others[1].splitlines()[-1].startswith(f"| {goals.SB3} | 0.750 |")
+    assert others[::2] == [f"## {task}" for task in known.STEPS]
+    assert others[1].splitlines()[-1].startswith(f"| {known.SB3} | 0.750 |")
 
 
 def test_exploratory_arms_are_beside_those_of_the_design_with_the_same_seeds(
@@ -154,21 +156,46 @@ def test_exploratory_arms_are_beside_those_of_the_design_with_the_same_seeds(
     rows = [
         rows_of(TASKS[1], arm, seed, 0.4)
         for seed in (2, 3, 4)
-        for arm in list(goals.EXPLORATORY)[: 4 if seed == 4 else None]
+        for arm in list(known.EXPLORATORY)[: 4 if seed == 4 else None]
     ]
     write_table(pd.concat(rows), tmp_path / "explored.csv")
-    head, _, *lines = goals.explored_table(tmp_path / "explored.csv", kept).splitlines()
+    head, _, *lines = tables.explored_table(tmp_path / "explored.csv", kept).splitlines()
     assert head == f"| arm | {TASKS[1]}, 2 runs | 95 % |"
     means = {line.split(" | ")[0][2:]: float(line.split(" | ")[1]) for line in lines}
-    assert means.keys() == {*goals.ARMS, *goals.EXPLORATORY}
+    assert means.keys() == {*known.ARMS, *known.EXPLORATORY}
     # Of the design PER has 0.4 and a thousandth for each seed.
-    assert means[goals.PER] == pytest.approx(0.75 * (0.4 + 0.0025), abs=6e-4)
+    assert means[known.PER] == pytest.approx(0.75 * (0.4 + 0.0025), abs=6e-4)
     assert means["PER, raised"] == pytest.approx(0.75 * 0.4, abs=6e-4)
+
+
+def test_unplanned_differences_are_by_seed_in_each_task(kept: Path) -> None:
+    head, _, *lines = tables.unplanned_table(kept).splitlines()
+    assert head == f"| unplanned | {' | '.join(known.PLANNED)} | mean |"
+    # PER has 0.8, MPFA-PER 0.7, half batches 0.65 and HER 0.6; the tasks have all, half and none.
+    for line, gap in zip(lines, (0.2, -0.1, 0.1, 0.05), strict=True):
+        cells = [cell.split()[0] for cell in line.split(" | ")[1:]]
+        for cell, factor in zip(cells, (1.0, 0.5, 0.0, 0.5), strict=True):
+            assert float(cell) == pytest.approx(0.75 * gap * factor, abs=6e-4)
+
+
+def test_the_peer_is_compared_on_the_seeds_that_both_have(kept: Path, tmp_path: Path) -> None:
+    beside = [
+        rows_of(TASKS[1], arm, seed, height + more * (seed - 903))
+        for arm, height, more in ((known.SB3, 0.6, 0.02), ("HER", 0.4, 0.0))
+        for seed in (902, 903, 904)
+    ]
+    # To the last no run of HER belongs.
+    beside.append(rows_of(TASKS[1], known.SB3, 905, 1.0))
+    write_table(pd.concat(beside), tmp_path / "beside.csv")
+    _, _, first, second = tables.peer_table(kept, tmp_path / "beside.csv").splitlines()
+    assert first == f"| {TASKS[0]} | 1 | +0.300 | one run |"
+    assert second == f"| {TASKS[1]} | 3 | +0.150 | [+0.113, +0.187] |"
 
 
 def test_page_has_the_tables_of_the_kept_rows() -> None:
     page = (ROOT / "docs/results/goals.md").read_text(encoding="utf-8")
-    for part in goals.tables().split("\n\n"):
+    parts = tables.tables(), tables.unplanned_table(), tables.peer_table()
+    for part in "\n\n".join(parts).split("\n\n"):
         assert part in page or part == "## What was sampled"
 
 
@@ -177,16 +204,16 @@ def test_planned_differences_wait_for_all_runs(kept: Path, task: str, seeds: lis
     rows = read_table(kept)
     gone = (rows["task"] == task) & (rows["method"] == "HER") & rows["seed"].isin(list(seeds))
     write_table(rows[~gone], kept)
-    said = goals.tables(kept).split("\n\n")[0]
+    said = tables.tables(kept).split("\n\n")[0]
     assert said == f"The planned comparisons need more runs: HER on {task}."
 
 
 def test_settings_are_those_of_the_search_on_seeds_of_its_own() -> None:
-    assert not {*goals.SEARCH_SEEDS} & {*goals.SEEDS}
-    found = goals.areas(read_table(goals.SEARCHED)).groupby(["task", "method"])["area"].mean()
-    for task in goals.PLANNED:
+    assert not {*known.SEARCH_SEEDS} & {*known.SEEDS}
+    found = tables.areas(read_table(tables.SEARCHED)).groupby(["task", "method"])["area"].mean()
+    for task in known.PLANNED:
         best = dict(word.split("=") for word in found[task].idxmax().split())
-        assert {name: float(value) for name, value in best.items()} == goals.CHOSEN[task]
+        assert {name: float(value) for name, value in best.items()} == known.CHOSEN[task]
 
 
 # What an arm says of the replay, goals in hindsight, updates of a step and the size of a batch.
@@ -206,25 +233,25 @@ SAYS: dict[str, tuple[str, int | None, int, int]] = {
 }
 
 
-@pytest.mark.parametrize("arm", [*goals.ARMS, *goals.EXPLORATORY])
+@pytest.mark.parametrize("arm", [*known.ARMS, *known.EXPLORATORY])
 def test_run_is_that_of_the_page_with_the_settings_of_its_arm(
     arm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
 
     def main(words: list[str]) -> Path:
-        options, _ = goals.page.parse(words)
+        options, _ = runs.page.parse(words)
         asked.append(options)
         scores = rows_of("", "", 0, 0.5)
-        write_table(scores, tmp_path / goals.page.SCORES)
-        write_table(scores.assign(effective_sample_size=9.0), tmp_path / goals.page.STATISTICS)
+        write_table(scores, tmp_path / runs.page.SCORES)
+        write_table(scores.assign(effective_sample_size=9.0), tmp_path / runs.page.STATISTICS)
         return tmp_path
 
-    monkeypatch.setattr(goals.page, "main", main)
+    monkeypatch.setattr(runs.page, "main", main)
     # The tasks themselves are of an extra.
-    monkeypatch.setattr(goals.page, "Task", lambda *_, **__: SimpleNamespace(has_goal=True))
+    monkeypatch.setattr(runs.page, "Task", lambda *_, **__: SimpleNamespace(has_goal=True))
     settings = {"gamma": 0.95, "tau": 0.02, "noise": 0.15}
-    scores, said = goals.run("FetchReach-v4", arm, 3, settings, tmp_path)
+    scores, said = runs.run("FetchReach-v4", arm, 3, settings, tmp_path)
     [options] = asked
     made = options.replay, options.hindsight, options.updates, options.batch_size
     assert made == SAYS[arm]
@@ -233,18 +260,19 @@ def test_run_is_that_of_the_page_with_the_settings_of_its_arm(
     assert (options.steps, options.every, options.start) == (5_000, 250, 1_000)
     assert options.width == 64
     assert {*scores["method"]} == {arm} and {*scores["seed"]} == {3}
-    assert (said is not None) == (arm in (goals.PER, goals.MPFA))
+    assert (said is not None) == (arm in (known.PER, known.MPFA))
 
 
 def test_arms_that_weigh_by_what_is_positive_know_it_where_each_step_costs() -> None:
     told = {
         arm
-        for arm in {**goals.ARMS, **goals.EXPLORATORY}
-        if "--positive-above=-0.5" in goals.words_of_arm(arm, "FetchReach-v4")
+        for arm in {**known.ARMS, **known.EXPLORATORY}
+        if "--positive-above=-0.5" in known.words_of_arm(arm, "FetchReach-v4")
     }
-    assert told == {goals.MPFA, *list(goals.EXPLORATORY)[:4]}
+    assert told == {known.MPFA, *list(known.EXPLORATORY)[:4]}
     for arm in told:
-        assert goals.words_of_arm(arm, "PointMaze_UMaze-v3") == [*goals.EVERY[arm]]
+        words = ["--replay", *known.EVERY[arm].split()]
+        assert known.words_of_arm(arm, "PointMaze_UMaze-v3") == words
 
 
 def test_what_was_sampled_is_a_mean_over_evaluations_after_updates_and_runs(kept: Path) -> None:
@@ -252,13 +280,13 @@ def test_what_was_sampled_is_a_mean_over_evaluations_after_updates_and_runs(kept
         rows_of(TASKS[0], "", seed, 0.5)
         .drop(columns="score")
         # Before the first update nothing was sampled, but the buffer has rows.
-        .assign(**{key: [None, 0.2 + 0.2 * seed] for key in goals.SAMPLED})
+        .assign(**{key: [None, 0.2 + 0.2 * seed] for key in tables.SAMPLED})
         .assign(positive_fraction_buffer=[0.0, 0.2 + 0.2 * seed])
         for seed in range(2)
     )
-    for arm in goals.ARMS:
-        if (rows := goals.sampled(said, arm)) is not None:
-            goals.add(rows.assign(method=arm), goals.sampled_of(kept))
-    per, mpfa = goals.tables(kept).split("\n\n")[-1].splitlines()[2:]
-    assert per == f"| {TASKS[0]} | {goals.PER} |" + "  |" * 5 + " 0.300 |"
-    assert mpfa == f"| {TASKS[0]} | {goals.MPFA} |" + " 0.300 |" * 6
+    for arm in known.ARMS:
+        if (rows := runs.sampled(said, arm)) is not None:
+            runs.add(rows.assign(method=arm), tables.sampled_of(kept))
+    per, mpfa = tables.tables(kept).split("\n\n")[-1].splitlines()[2:]
+    assert per == f"| {TASKS[0]} | {known.PER} |" + "  |" * 5 + " 0.300 |"
+    assert mpfa == f"| {TASKS[0]} | {known.MPFA} |" + " 0.300 |" * 6

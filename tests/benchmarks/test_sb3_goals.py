@@ -12,7 +12,7 @@ import gymnasium_td3 as page
 from tests.integration.test_gymnasium_td3 import MAZE, POINT
 
 sb3 = pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is of the extra peers")
-sb3_goals = pytest.importorskip("benchmarks.sb3_goals")
+sb3_goals = pytest.importorskip("benchmarks.goals.sb3")
 
 
 def test_its_run_has_the_settings_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
