@@ -148,7 +148,8 @@ class Scale:
         """Normalize observations ``[..., O]``."""
         if not self.moves or not self.count:
             return observations
-        spread = (self.squares / self.count).sqrt().clamp(min=1e-2)
+        # Sums of what never changes are below zero by rounding.
+        spread = (self.squares / self.count).clamp(min=0.0).sqrt().clamp(min=1e-2)
         return ((observations - self.mean) / spread).clamp(-_FARTHEST, _FARTHEST)
 
     def normalize(self, sampled: SampledBatch) -> SampledBatch:

@@ -257,6 +257,14 @@ def test_observations_of_goal_tasks_are_normalized_by_all_that_was_seen() -> Non
     assert torch.equal(Scale(3, moves=False)(seen), seen)
 
 
+def test_observations_that_never_change_are_normalized_to_zero() -> None:
+    scale, seen = Scale(3, moves=True), torch.tensor([0.1, 1.7, 123.456])
+    for _ in range(100):
+        scale.see(seen.expand(10, 3))
+    assert (scale.squares < 0.0).any()
+    assert scale(seen).abs().max() < 1e-2
+
+
 def test_hindsight_adds_rows_and_another_method_takes_it_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
