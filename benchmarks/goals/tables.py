@@ -118,31 +118,30 @@ def peer_table(kept: Path = KEPT, beside: Path = BESIDE) -> str:
 
 
 def difference(gaps: Array) -> tuple[str, str]:
-    """Return the mean of differences by seed, and its interval."""
+    """Return the mean of differences by seed, and its interval; of none two empty words."""
+    if not len(gaps):
+        return "", ""
     signed = partial(number, sign=True)
     middle = mean_interval(gaps)
     return signed(middle.value), interval(middle, [gaps], signed)
 
 
 def explored_table(explored: Path = EXPLORED, kept: Path = KEPT) -> str:
-    """Return mean areas of exploratory arms in each task, beside those of the design.
-
-    Seeds are those of which each exploratory arm has a run.
-    """
-    by_run, found = ["task", "seed"], [areas(read_table(file)) for file in (explored, kept)]
-    ours, beside = (rows.pivot(index=by_run, columns="method", values="area") for rows in found)
-    runs = ours.dropna().join(beside).dropna(axis=1, how="all")
-    tasks = [task for task in STEPS if task in runs.index]
+    """Return the areas of exploratory arms, and their differences from HER on the same seeds."""
+    rows = areas(pd.concat([read_table(explored), read_table(kept)]))
+    runs = rows.pivot(index=["method", "seed"], columns="task", values="area")
+    runs = runs.loc[:, [task for task in STEPS if task in set(read_table(explored)["task"])]]
     lines = []
-    for arm in [name for name in {**ARMS, **EXPLORATORY} if name in runs]:
-        line = [arm]
-        for task in tasks:
-            own = runs.loc[task][arm].dropna().to_numpy()
-            middle = mean_interval(own) if len(own) else None
-            line += [number(middle.value), interval(middle, [own], number)] if middle else ["", ""]
-        lines.append(line)
-    heads = [head for task in tasks for head in (f"{task}, {len(runs.loc[task])} runs", "95 %")]
-    return table(["arm", *heads], lines)
+    for arm in [name for name in EXPLORATORY if name in runs.index]:
+        line, gaps = [arm], runs.loc[arm] - runs.loc["HER"]
+        for task in runs:
+            own = gaps[task].dropna()
+            area = runs.loc[arm][task][own.index].mean()
+            line.append(f"{number(area)} ({len(own)})" if len(own) else "")
+            line.append(" ".join(difference(own.to_numpy())))
+        lines.append([*line, " ".join(difference(gaps.dropna().mean(axis=1).to_numpy()))])
+    heads = [head for task in runs for head in (f"{task} (runs)", "− HER")]
+    return table(["arm", *heads, "− HER, mean of the tasks"], lines)
 
 
 def sampled_table(rows: pd.DataFrame) -> str:

@@ -149,23 +149,25 @@ def test_planned_differences_are_of_the_means_over_the_tasks(kept: Path) -> None
     assert others[1].splitlines()[-1].startswith(f"| {known.SB3} | 0.750 |")
 
 
-def test_exploratory_arms_are_beside_those_of_the_design_with_the_same_seeds(
+def test_exploratory_arms_are_compared_with_her_on_the_same_seeds(
     kept: Path, tmp_path: Path
 ) -> None:
-    # Of the last seed one arm has no run yet.
-    rows = [
-        rows_of(TASKS[1], arm, seed, 0.4)
-        for seed in (2, 3, 4)
-        for arm in list(known.EXPLORATORY)[: 4 if seed == 4 else None]
-    ]
+    # Of the last arm a run of another seed is there, and in another task none.
+    first, *_, last = known.EXPLORATORY
+    rows = [rows_of(TASKS[0], first, seed, 0.7 + 0.001 * seed) for seed in (2, 3)]
+    rows += [rows_of(TASKS[1], first, seed, 0.4 + 0.001 * seed) for seed in (2, 3)]
+    rows += [rows_of(TASKS[1], last, seed, 0.2) for seed in (3, 40)]
     write_table(pd.concat(rows), tmp_path / "explored.csv")
     head, _, *lines = tables.explored_table(tmp_path / "explored.csv", kept).splitlines()
-    assert head == f"| arm | {TASKS[1]}, 2 runs | 95 % |"
-    means = {line.split(" | ")[0][2:]: float(line.split(" | ")[1]) for line in lines}
-    assert means.keys() == {*known.ARMS, *known.EXPLORATORY}
-    # Of the design PER has 0.4 and a thousandth for each seed.
-    assert means[known.PER] == pytest.approx(0.75 * (0.4 + 0.0025), abs=6e-4)
-    assert means["PER, raised"] == pytest.approx(0.75 * 0.4, abs=6e-4)
+    heads = " | ".join(f"{task} (runs) | − HER" for task in TASKS)
+    assert head == f"| arm | {heads} | − HER, mean of the tasks |"
+    # HER has 0.6 and 0.3.
+    two = "two runs: no interval"
+    assert lines[0] == (
+        f"| {first} | 0.527 (2) | +0.075 {two} | 0.302 (2) | +0.075 {two} | +0.075 {two} |"
+    )
+    assert lines[1] == f"| {last} |  |   | 0.150 (1) | -0.077 one run |   |"
+    assert len(lines) == 2
 
 
 def test_unplanned_differences_are_by_seed_in_each_task(kept: Path) -> None:
