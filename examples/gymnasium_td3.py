@@ -41,7 +41,7 @@ from tqdm import tqdm
 
 import torchrl_mpfa as mpfa
 from torchrl_mpfa.methods import loss_options, make_replay, method_named
-from torchrl_mpfa.methods.her import GymnasiumGoals, HindsightGoals
+from torchrl_mpfa.methods.her import GOALS_FOR, GymnasiumGoals, HindsightGoals
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.selection import SampledBatch
 from training import files
@@ -230,7 +230,7 @@ def train(options: argparse.Namespace, task: Task) -> pd.DataFrame:
     replay = make_replay(options.replay, **options.method)
     method = replay.method
     if method.hindsight:
-        relabel = GymnasiumGoals(task.compute_reward)
+        relabel = GymnasiumGoals(task.compute_reward, goals_for=options.goals_for)
         replay.buffer.append_transform(HindsightGoals(relabel, goals=method.hindsight))
     kept = ["observation", "action", "next", *replay.entries]
     # Networks as TD3's authors have them; the defaults are DDPG's.
@@ -294,6 +294,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
         "--positive-above", type=float, help="reward, for MPFA-PER; between rewards"
     )
     parser.add_argument("--hindsight", type=int, help="goals for which an episode counts again")
+    parser.add_argument("--goals-for", choices=GOALS_FOR, default=GOALS_FOR[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--start", type=int, default=5_000, help="steps at random before learning")
@@ -336,6 +337,7 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
     if method.hindsight and not task.has_goal:
         parser.error(f"--replay must be one without hindsight, as {options.task} has no goals")
     options.name = options.replay + (f"-hindsight{options.hindsight}" if options.hindsight else "")
+    options.name += "-transitions" if options.goals_for == "transition" else ""
     options.name += f"-updates{options.updates}" if options.updates > 1 else ""
     return options, task
 

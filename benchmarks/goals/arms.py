@@ -26,6 +26,7 @@ EXPLORATORY: Final = {
     "HER, two updates a step": "her --updates 2",
     "HER, two updates of half a batch": "her --updates 2 --batch-size 128",
     "HER, eight goals an episode": "her --hindsight 8",
+    "HER, goals for each transition": "her --goals-for transition",
 }
 """Parts of MPFA-PER with hindsight, more updates, and more goals."""
 EVERY: Final = {**ARMS, SB3: "", **EXPLORATORY}

@@ -200,6 +200,33 @@ def test_rows_of_a_goal_task_end_with_the_goal_and_its_rewards_are_those_of_the_
     assert (rows["observation"][:10, 3:] == rows["observation"][0, 3:]).all()
 
 
+def test_goals_for_each_transition_are_reached_after_it_and_all_of_them_are_as_likely() -> None:
+    task = Task(POINT, seed=0)
+    [rows] = [collect(task, None, np.random.default_rng(0))]
+    seeded = {"generator": torch.Generator().manual_seed(0)}
+    relabel = GymnasiumGoals(task.compute_reward, goals_for="transition", **seeded)
+    again = [relabel(rows, torch.tensor([0, 1, 2, 3])) for _ in range(300)]
+    achieved = rows["next", "achieved_goal"]
+    counts = torch.zeros(10, 10)
+    for part in again:
+        assert len(part) == 40
+        assert torch.equal(
+            part["observation"][:, :3], rows["observation"].repeat_interleave(4, 0)[:, :3]
+        )
+        goals = part["observation"][:, 3:]
+        assert torch.equal(part["next", "observation"][:, 3:], goals)
+        place = (goals[:, None] == achieved).all(-1).float().argmax(-1)
+        far = (achieved.repeat_interleave(4, 0) - goals).norm(dim=-1) > 0.3
+        assert torch.equal(part["next", "reward"].flatten(), -far.float())
+        counts.index_put_((torch.arange(10).repeat_interleave(4), place), torch.ones(40), True)
+    shares = counts / counts.sum(1, keepdim=True)
+    for step in range(10):
+        assert not counts[step, :step].any()
+        assert (shares[step, step:] - 1 / (10 - step)).abs().max() < 0.06
+    with pytest.raises(ValueError, match="goals_for must be one of episode, transition, got 'row'"):
+        GymnasiumGoals(task.compute_reward, goals_for="row")
+
+
 class Towards:
     """Drives to the goal, and away from it in the last steps if it is to leave."""
 

@@ -40,6 +40,10 @@ class Relabel(Protocol):
         ...
 
 
+GOALS_FOR = "episode", "transition"
+"""What a goal in hindsight may be chosen for."""
+
+
 class GymnasiumGoals:
     """Gives an episode of a goal task of Gymnasium goals that it reached; the task itself pays.
 
@@ -49,6 +53,12 @@ class GymnasiumGoals:
     Args:
         compute_reward: That of the task: from goals that were achieved and wanted, ``[R, G]`` each,
             and an empty mapping, to rewards, ``[R]``.
+        goals_for: ``"episode"``: a goal is that of all steps before it. ``"transition"``: each
+            transition has as many goals of its own, reached after it or later, as published.
+        generator: Source of the choice of goals for transitions; None: PyTorch's own.
+
+    Raises:
+        ValueError: If ``goals_for`` is neither.
 
     Examples:
         >>> import numpy as np
@@ -69,18 +79,29 @@ class GymnasiumGoals:
     entries: ClassVar[tuple[NestedKey, ...]] = (("next", "achieved_goal"),)
     """Entries that it reads, other than observation, reward and ends; its rows lack them."""
 
-    def __init__(self, compute_reward: Callable[[Any, Any, dict[str, Any]], Any]) -> None:
-        self._compute_reward = compute_reward
+    def __init__(
+        self,
+        compute_reward: Callable[[Any, Any, dict[str, Any]], Any],
+        *,
+        goals_for: str = "episode",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if goals_for not in GOALS_FOR:
+            raise ValueError(f"goals_for must be one of {', '.join(GOALS_FOR)}, got {goals_for!r}")
+        self._compute_reward, self._goals_for = compute_reward, goals_for
+        self._generator = generator
 
     def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:
         """Relabel an episode.
 
         Args:
             episode: Its transitions in their order, batch size ``[T]``.
-            steps: Numbers of the steps after which the goals were reached, ``[K]``.
+            steps: Numbers of the steps after which the goals were reached, ``[K]``; for goals of
+                transitions only how many these are.
 
         Returns:
-            The transitions before each of these steps and that of the step itself, ``[R]``.
+            The transitions before each of these steps and that of the step itself, ``[R]``; or
+            all transitions, ``K`` times each.
 
         Raises:
             ValueError: If the episode was terminated: whether another goal would have ended it is
@@ -92,8 +113,16 @@ class GymnasiumGoals:
                 "on at its goal (continuing_task=True in gymnasium-robotics' mazes)"
             )
         achieved = episode["next", "achieved_goal"]
-        chosen = torch.cat([torch.arange(step + 1) for step in steps.tolist()])
-        goals = achieved[steps].repeat_interleave(steps.to(achieved.device) + 1, dim=0)
+        if self._goals_for == "transition":
+            length = len(achieved)
+            chosen = torch.arange(length).repeat_interleave(len(steps))
+            ahead = torch.rand(len(chosen), generator=self._generator) * (length - chosen)
+            # A product may be rounded up to the length.
+            reached = (chosen + ahead.long()).clamp(max=length - 1)
+        else:
+            chosen = torch.cat([torch.arange(step + 1) for step in steps.tolist()])
+            reached = steps.repeat_interleave(steps + 1)
+        goals = achieved[reached]
         rows = episode.exclude(*self.entries)[chosen]
         for key in ("observation", ("next", "observation")):
             rows[key][..., -goals.shape[-1] :] = goals
