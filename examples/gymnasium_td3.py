@@ -336,6 +336,8 @@ def parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, Task]:
         parser.error(" ".join(str(error).split()))
     if method.hindsight and not task.has_goal:
         parser.error(f"--replay must be one without hindsight, as {options.task} has no goals")
+    if options.goals_for == "transition" and not method.hindsight:
+        parser.error("--goals-for must be episode without goals in hindsight, got transition")
     options.name = options.replay + (f"-hindsight{options.hindsight}" if options.hindsight else "")
     options.name += "-transitions" if options.goals_for == "transition" else ""
     options.name += f"-updates{options.updates}" if options.updates > 1 else ""

@@ -37,7 +37,7 @@ def run(
 
         scores = pd.DataFrame(train(page.parse(words)[0]), columns=["steps", "score"])
         return scores.assign(**name)[list(COLUMNS)], None
-    made = page.main([*words, *words_of_arm(arm, task), "--folder", str(folder)])
+    made = page.main([*words, *words_of_arm(arm, task), "--folder", str(folder / arm)])
     scores, said = (
         read_table(made / file).assign(**name) for file in (page.SCORES, page.STATISTICS)
     )

@@ -92,13 +92,16 @@ def task_table(rows: pd.DataFrame, of_runs: pd.DataFrame) -> str:
     return table(["arm", "area", "95 %", "at the end", "95 %", "area of each run"], lines)
 
 
-def unplanned_table(kept: Path = KEPT) -> str:
+def unplanned_table(kept: Path = KEPT, explored: Path = EXPLORED) -> str:
     """Return differences in each planned task and in their mean, of which few were planned."""
-    runs = areas(read_table(kept)).pivot(index=["method", "seed"], columns="task", values="area")
+    rows = pd.concat([read_table(kept), read_table(explored)])
+    runs = areas(rows).pivot(index=["method", "seed"], columns="task", values="area")
     runs = runs[list(PLANNED)].assign(mean=runs[list(PLANNED)].mean(axis=1))
     _, her, per, mpfa, halves = ARMS
     lines = []
-    for ours, theirs in ((per, her), (mpfa, per), (mpfa, her), (halves, her)):
+    pairs = [(per, her), (mpfa, per), (mpfa, her), (halves, her)]
+    pairs += [(mpfa, part) for part in list(EXPLORATORY)[:4] if part in runs.index]
+    for ours, theirs in pairs:
         gaps = (runs.loc[ours] - runs.loc[theirs]).dropna()
         found = [difference(gaps[name].to_numpy()) for name in gaps]
         lines.append([f"{ours} − {theirs}", *(" ".join(each) for each in found)])

@@ -169,14 +169,24 @@ def test_exploratory_arms_are_compared_with_her_on_the_same_seeds(
     assert len(lines) == 2
 
 
-def test_unplanned_differences_are_by_seed_in_each_task(kept: Path) -> None:
-    head, _, *lines = tables.unplanned_table(kept).splitlines()
+def test_unplanned_differences_are_by_seed_in_each_task(kept: Path, tmp_path: Path) -> None:
+    parts = list(known.EXPLORATORY)
+    rows = [
+        rows_of(task, part, seed, 0.6 * factor + 0.001 * seed)
+        for task, factor in zip(known.PLANNED, (1.0, 0.5, 0.0), strict=True)
+        for part in (parts[1], parts[4])
+        for seed in range(8)
+    ]
+    write_table(pd.concat(rows), tmp_path / "explored.csv")
+    head, _, *lines = tables.unplanned_table(kept, tmp_path / "explored.csv").splitlines()
     assert head == f"| unplanned | {' | '.join(known.PLANNED)} | mean |"
     # PER has 0.8, MPFA-PER 0.7, half batches 0.65 and HER 0.6; the tasks have all, half and none.
-    for line, gap in zip(lines, (0.2, -0.1, 0.1, 0.05), strict=True):
+    for line, gap in zip(lines, (0.2, -0.1, 0.1, 0.05, 0.1), strict=True):
         cells = [cell.split()[0] for cell in line.split(" | ")[1:]]
         for cell, factor in zip(cells, (1.0, 0.5, 0.0, 0.5), strict=True):
             assert float(cell) == pytest.approx(0.75 * gap * factor, abs=6e-4)
+    # Of the arms beside the design the parts of MPFA-PER are here.
+    assert lines[-1].startswith(f"| {known.MPFA} − {parts[1]} |")
 
 
 def test_the_peer_is_compared_on_the_seeds_that_both_have(kept: Path, tmp_path: Path) -> None:
@@ -259,7 +269,7 @@ def test_run_is_that_of_the_page_with_the_settings_of_its_arm(
     made = options.replay, options.hindsight, options.updates, options.batch_size
     assert made == SAYS[arm]
     assert options.goals_for == ("transition" if "transition" in arm else "episode")
-    assert (options.task, options.seed, options.folder) == ("FetchReach-v4", 3, tmp_path)
+    assert (options.task, options.seed, options.folder) == ("FetchReach-v4", 3, tmp_path / arm)
     assert (options.gamma, options.tau, options.noise) == (0.95, 0.02, 0.15)
     assert (options.steps, options.every, options.start) == (5_000, 250, 1_000)
     assert options.width == 64

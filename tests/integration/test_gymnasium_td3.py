@@ -114,6 +114,10 @@ def test_action_reaches_the_whole_range_of_the_task() -> None:
     [
         (["--start", "99"], "--start must be at least one batch of 100, got 99"),
         (["--every", "300", "--steps", "200"], "--every must be in 10 to 200, got 300"),
+        (
+            ["--task", POINT, "--replay", "per", "--goals-for", "transition"],
+            "--goals-for must be episode without goals in hindsight, got transition",
+        ),
         (["--updates", "0"], "--updates must be at least 1, got 0"),
         (["--replay", "rud"], "invalid choice: 'rud'"),
         (["--task", PENDULUM, "--replay", "her"], f"without hindsight, as {PENDULUM} has no goals"),

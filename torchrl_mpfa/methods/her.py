@@ -54,8 +54,10 @@ class GymnasiumGoals:
         compute_reward: That of the task: from goals that were achieved and wanted, ``[R, G]`` each,
             and an empty mapping, to rewards, ``[R]``.
         goals_for: ``"episode"``: a goal is that of all steps before it. ``"transition"``: each
-            transition has as many goals of its own, reached after it or later, as published.
-        generator: Source of the choice of goals for transitions; None: PyTorch's own.
+            transition has as many goals of its own, reached after it or later, as published; no
+            more than the episode has steps.
+        generator: Source of the choice of goals for transitions, of which the generator of
+            :class:`HindsightGoals` knows nothing; None: PyTorch's own.
 
     Raises:
         ValueError: If ``goals_for`` is neither.
@@ -165,7 +167,7 @@ class HindsightGoals(Transform):
     Args:
         relabel: Gives an episode other goals, say ``mpfa_envs.GoalRelabeling``.
         goals: Goals of an episode ``K``: places reached after steps at random, each the goal of all
-            steps before it.
+            steps before it, unless ``relabel`` chooses goals of its own.
         episode_key: Key of the episode's number, ``[..., 1]``.
         generator: Source of the choice of goals; None: PyTorch's own. Its state is not part of the
             buffer's.
