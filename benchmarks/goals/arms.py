@@ -18,17 +18,21 @@ ARMS: Final = {
     "half batches with hindsight": "uniform_halves --hindsight 4",
 }
 """What ``--replay`` of an arm is, and what follows it."""
-EXPLORATORY: Final = {
+PARTS: Final = {
     "MPFA-PER, neither raised nor decayed": "mpf_per --hindsight 4",
     "reward and TD error": "td_reward --hindsight 4",
     "TD error and action gradient": "td_loss --hindsight 4",
     "PER, raised": "raise --hindsight 4",
+}
+"""Parts of MPFA-PER with hindsight."""
+EXPLORATORY: Final = {
+    **PARTS,
     "HER, two updates a step": "her --updates 2",
     "HER, two updates of half a batch": "her --updates 2 --batch-size 128",
     "HER, eight goals an episode": "her --hindsight 8",
     "HER, goals for each transition": "her --goals-for transition",
 }
-"""Parts of MPFA-PER with hindsight, more updates, and more goals."""
+"""Arms beside the design: parts, more updates, and more goals."""
 EVERY: Final = {**ARMS, SB3: "", **EXPLORATORY}
 STEPS: Final[Mapping[str, int]] = {
     "FetchReach-v4": 5_000,

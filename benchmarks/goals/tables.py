@@ -8,7 +8,7 @@ from typing import Final
 
 import pandas as pd
 
-from benchmarks.goals.arms import ARMS, EVERY, EXPLORATORY, PLANNED, SB3, STEPS
+from benchmarks.goals.arms import ARMS, EVERY, EXPLORATORY, PARTS, PLANNED, SB3, STEPS
 from benchmarks.planned import Planned, planned_table
 from training.comparison.report import interval, number, table
 from training.records import area_under, read_table
@@ -100,7 +100,7 @@ def unplanned_table(kept: Path = KEPT, explored: Path = EXPLORED) -> str:
     _, her, per, mpfa, halves = ARMS
     lines = []
     pairs = [(per, her), (mpfa, per), (mpfa, her), (halves, her)]
-    pairs += [(mpfa, part) for part in list(EXPLORATORY)[:4] if part in runs.index]
+    pairs += [(mpfa, part) for part in PARTS if part in runs.index]
     for ours, theirs in pairs:
         gaps = (runs.loc[ours] - runs.loc[theirs]).dropna()
         found = [difference(gaps[name].to_numpy()) for name in gaps]

@@ -37,7 +37,7 @@ if _missing:
 gc.set_threshold(100_000, 50, 50)
 _status: list[int] = []
 _is_first = "multiprocessing.util" not in sys.modules
-"""What was imported before registered its own end before: it has to come to that by itself."""
+"""``_end`` would come before what multiprocessing, imported first, has registered for its end."""
 
 
 def end_with(status: int) -> None:

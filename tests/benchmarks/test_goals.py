@@ -283,7 +283,7 @@ def test_arms_that_weigh_by_what_is_positive_know_it_where_each_step_costs() -> 
         for arm in {**known.ARMS, **known.EXPLORATORY}
         if "--positive-above=-0.5" in known.words_of_arm(arm, "FetchReach-v4")
     }
-    assert told == {known.MPFA, *list(known.EXPLORATORY)[:4]}
+    assert told == {known.MPFA, *known.PARTS}
     for arm in told:
         words = ["--replay", *known.EVERY[arm].split()]
         assert known.words_of_arm(arm, "PointMaze_UMaze-v3") == words

@@ -119,8 +119,7 @@ class GymnasiumGoals:
             length = len(achieved)
             chosen = torch.arange(length).repeat_interleave(len(steps))
             ahead = torch.rand(len(chosen), generator=self._generator) * (length - chosen)
-            # A product may be rounded up to the length.
-            reached = (chosen + ahead.long()).clamp(max=length - 1)
+            reached = chosen + ahead.long()
         else:
             chosen = torch.cat([torch.arange(step + 1) for step in steps.tolist()])
             reached = steps.repeat_interleave(steps + 1)
